@@ -276,7 +276,9 @@ class Heartbeats:
         elif state != BOOT_UP or before == BOOT_UP:
             self._stopped.add(status.node)
         uptime, uptime_before = values[status.uptime], self.image.values_before[status.uptime]
-        restarted = state == BOOT_UP or uptime < uptime_before < self._last_uptime
+        # A pendant that takes over from another one reports its own uptime.
+        decreased = status.node in self._needed and uptime < uptime_before < self._last_uptime
+        restarted = state == BOOT_UP or decreased
         if restarted:
             self.booted.add(status.node)
             self.image.restart(status.emergency)

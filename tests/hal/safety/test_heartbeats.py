@@ -473,6 +473,14 @@ def test_node_whose_uptime_decreases_is_listed_as_booted_and_reported_as_reset(r
         assert running.heartbeats.quiet
 
 
+def test_pendant_that_takes_over_with_a_lower_uptime_is_no_restart(running: Nodes):
+    for uptime in (9, 0):
+        running.receive(running.frame("PENDANT", Uptime=uptime))
+        assert running.heartbeats.booted == set()
+        assert running.heartbeats.quiet
+        assert running.evaluate() == {}
+
+
 def test_same_emergency_after_a_restart_of_the_node_is_accepted(running: Nodes):
     emergency = running.frame("LEFT_SK", "EMCY", ErrorCode=0x7305)
     running.receive(emergency)

@@ -242,7 +242,7 @@ def test_keyboard_of_a_terminal_that_does_not_control_the_process_returns_no_lin
 def test_a_takeover_by_a_new_pendant_does_not_disturb_the_hal(world: World) -> None:
     old = world.active()
     old.assist(0.4)
-    world.run(100)
+    world.run(1600)  # until the uptime of the old pendant is above that of the new one
     events = world.hal.events.count
     new = world.node()
     world.run(50)
