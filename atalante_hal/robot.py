@@ -92,7 +92,7 @@ class Thresholds:
     #: Example: with 0.5, a hot drive needs a torque limit of at least 100 Nm if the same drive of the other leg has 200 Nm.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
-    #: Largest accepted angle [rad] outside a position limit. A joint beyond this angle is out of range.
+    #: Largest accepted distance [rad] of a joint angle beyond its position limit. A joint with a larger distance is out of range.
     position_tolerance: float
     #: Largest plausible torque [Nm] that a drive reports while it is off.
     #: While a drive is on, a reported torque of up to `torque_max` plus this value is plausible.

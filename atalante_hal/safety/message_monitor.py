@@ -121,7 +121,7 @@ class MessageMonitor:
         self._evidence = [0] * len(messages)
         #: Leaky bucket of each disturbance, by row and diagnostic. A disturbance without an entry has an empty bucket.
         self._disturbed: dict[tuple[int, Dtc], Qualification] = {}
-        #: True for each row that was trusted at least once. Other rows may belong to nodes that are not connected.
+        #: For each message: whether its sender was trusted at least once. If not, the sender may not be connected.
         self._was_trusted = [False] * len(messages)
         #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)

@@ -151,26 +151,33 @@ def test_wrong_motors_are_found_within_the_bound_of_the_fault_matrix() -> None:
         assert case.detected == case.stimuli[1].start + moments.FOUND
 
 
+MOTOR_IN_HOLD = MomentTask(Moment.HOLD, (index("F84", "LEFT_SH in HOLD with 0 times its torque"),))
+
+
+def begin_of_motor_fault() -> int:
+    """Return the first cycle of the motor fault of `MOTOR_IN_HOLD`."""
+    ((id_, number),) = MOTOR_IN_HOLD.cases
+    return schedule(Moment.HOLD, ENGINE).begins + SCENARIOS[id_].cases[number].stimuli[1].start
+
+
 @pytest.mark.sample(2)
 @pytest.mark.parametrize(("cycle", "failures"), [(0, 0), (moments.FOUND - 1, 0), (-1, 1), (moments.FOUND, 1)])
 def test_a_wrong_motor_may_move_a_joint_fast_until_it_is_found(
     monkeypatch: pytest.MonkeyPatch, cycle: int, failures: int
 ) -> None:
-    case = index("F84", "LEFT_SH in HOLD with 0 times its torque")
-    begins = moments.schedule(Moment.HOLD, ENGINE).begins + SCENARIOS["F84"].cases[case[1]].stimuli[1].start
+    begins = begin_of_motor_fault()
 
     def fast(run: Observation) -> None:
         run.velocity[begins + cycle - 1, 3] = 1.25 * run.robot.velocity_max[3]
 
-    assert len(patched(monkeypatch, fast, MomentTask(Moment.HOLD, (case,))).failures) == failures
+    assert len(patched(monkeypatch, fast, MOTOR_IN_HOLD).failures) == failures
 
 
 @pytest.mark.parametrize(("cycle", "failures"), [(moments.FOUND + 29, 0), (moments.FOUND + 30, 1)])
 def test_cycles_without_data_of_a_wrong_motor_do_not_count_until_it_is_found(
     monkeypatch: pytest.MonkeyPatch, cycle: int, failures: int
 ) -> None:
-    case = index("F84", "LEFT_SH in HOLD with 0 times its torque")
-    begins = moments.schedule(Moment.HOLD, ENGINE).begins + SCENARIOS["F84"].cases[case[1]].stimuli[1].start
+    begins = begin_of_motor_fault()
 
     def silent(run: Observation) -> None:
         run.age[begins + 9 : begins + 39, run.messages.index("LEFT_SH_STATE")] = 5
@@ -178,7 +185,7 @@ def test_cycles_without_data_of_a_wrong_motor_do_not_count_until_it_is_found(
         run.age[begins + 69 : begins + 79, run.messages.index("RIGHT_SH_STATE")] = 5
         run.velocity[begins + cycle - 1, 3] = 1.25 * run.robot.velocity_max[3]
 
-    assert len(patched(monkeypatch, silent, MomentTask(Moment.HOLD, (case,))).failures) == failures
+    assert len(patched(monkeypatch, silent, MOTOR_IN_HOLD).failures) == failures
 
 
 @pytest.mark.parametrize(("moved", "failures"), [(4.0, 0), (6.0, 1)])

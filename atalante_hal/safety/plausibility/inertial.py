@@ -142,9 +142,8 @@ class Inertial:
         """
         implausible = self._follow(self._new if ages is None else ages.imu, self._interval, *self._readings)
         self._interval = next(self._intervals)
-        self._found, self.implausible = (
-            (_findings(self._excess), _wrong(self._excess)) if implausible else ((), frozenset())
-        )
+        self.implausible = _wrong(self._excess) if implausible else frozenset()
+        self._found = _findings(self._excess, self.implausible) if implausible else ()
         return bool(self._found)
 
     def findings(self) -> tuple[Finding, ...]:
@@ -372,8 +371,13 @@ def turn_rate(first: Vector, last: Vector, time: float) -> tuple[float, float, f
     return factor * x, factor * y, factor * z
 
 
-def _findings(excess: Excess) -> tuple[Finding, ...]:
-    """Return the findings about the values that exceed their limits."""
+def _findings(excess: Excess, wrong: frozenset[int]) -> tuple[Finding, ...]:
+    """Return the findings about the values that exceed their limits.
+
+    Args:
+        excess: values that exceed their limits.
+        wrong: result of `_wrong`.
+    """
     found = []
     for imu, (force, rate) in enumerate(zip(excess.force.tolist(), excess.rate.tolist(), strict=False)):
         if force:
@@ -382,7 +386,7 @@ def _findings(excess: Excess) -> tuple[Finding, ...]:
         elif rate:
             text = f"the gyroscope of the {IMUS[imu]} IMU contradicts the change of its attitude by {rate:.2f} rad/s"
             found.append(_finding(imu, rate, text))
-    if not _wrong(excess).isdisjoint((_TORSO, _PELVIS)):
+    if not wrong.isdisjoint((_TORSO, _PELVIS)):
         return tuple(found)
     tilt, rate = float(excess.tilt[0]), float(excess.rate[-1])
     contradict = "torso IMU and pelvis IMU contradict each other"

@@ -336,10 +336,11 @@ class AirwalkController:
         self._start, self._promised = (angles, rates), promise > 0.0
 
     def _check_hand_over(self) -> bool:
-        """Return whether the step starts outside the hand-over box, and count the step in the statistics.
+        """Return whether a step starts with larger deviations than its guide is certified for, and count the step.
 
-        Only steps with a certified guide are checked, and only after the end of the first right-stance step. The torque jump is
-        known after the first cycle of the step.
+        The guide is certified for deviations inside the hand-over box (`HandOver`). Only steps with a certified guide are checked
+        and counted, and only after the end of the first right-stance step. The torque jump is known after the first cycle of the
+        step.
         """
         if not (self._promised and self._assisting and self.statistics.steps):
             return False

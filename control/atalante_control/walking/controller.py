@@ -47,7 +47,7 @@ from atalante_control.walking.kernel import (
     sense,
     start,
 )
-from atalante_control.walking.kinematics import Kinematics
+from atalante_control.walking.kinematics import FOOT_TO_TIBIA, Kinematics
 from atalante_control.walking.lean import Lean
 from atalante_control.walking.phases import STEPPING, WALKING, Facts, Phase, next_phase
 from atalante_control.walking.placement import Placement
@@ -474,7 +474,7 @@ class WalkController:
         if self._gyro_source == SOLE:
             return sole.rotation[:, 2]
         tibia = rotation_of(state.imu_quaternion[_TIBIAE[self._stance]].tolist())
-        up: Vector = self._parts.chain.links[sole.link - 2].rotation @ tibia[2]
+        up: Vector = self._parts.chain.links[sole.link - FOOT_TO_TIBIA].rotation @ tibia[2]
         return up
 
     def _load_without(self, side: int) -> float:

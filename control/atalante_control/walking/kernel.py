@@ -23,7 +23,7 @@ from atalante_control.joint.pid import PidRecord, control
 from atalante_control.structured import Records
 from atalante_control.walking.attitude import Attitude, observe
 from atalante_control.walking.dcm import Balance, Stabiliser, ankle_torques, dcm, pressure_shift, within_sole
-from atalante_control.walking.kinematics import Chain, move
+from atalante_control.walking.kinematics import FOOT_TO_TIBIA, Chain, move
 from atalante_control.walking.lean import Lean, LeanConfig, follow_lean, lean_target, leg_target
 from atalante_control.walking.placement import (
     Motion,
@@ -217,7 +217,7 @@ def _replace_gyro(resting: int, measured: Measured, parts: Parts) -> None:
     sole, turn = parts.chain.soles[resting], (0.0, 0.0, 0.0)
     angular = sole.angular
     if parts.stages[0].gyro_source == TIBIA:
-        shank, rate = parts.chain.links[sole.link - 2], measured.tibiae[resting]
+        shank, rate = parts.chain.links[sole.link - FOOT_TO_TIBIA], measured.tibiae[resting]
         turn, angular = rotated(shank.rotation, (rate[0], rate[1], rate[2])), shank.angular
     for k in range(3):
         measured.gyro[k] = turn[k] - angular[k]
@@ -305,8 +305,7 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
 
 def _tibia(side: int, measured: Measured, parts: Parts) -> tuple[Quaternion, Vector3]:
     """Return the tilt of a tibia as a unit quaternion wxyz, and its angular velocity in the axes of the tibia [rad/s]."""
-    # The tibia is two links above the foot.
-    shank = parts.chain.links[parts.chain.soles[side].link - 2]
+    shank = parts.chain.links[parts.chain.soles[side].link - FOOT_TO_TIBIA]
     rotation, up, gyro = shank.rotation.T, parts.attitudes[0].rotation[2], measured.gyro
     rate = rotated(
         rotation,

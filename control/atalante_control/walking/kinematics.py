@@ -38,6 +38,10 @@ class Link:
     linear: Annotated[Vector, 3]  # m/s, velocity of the joint
 
 
+#: Index of the link of a foot minus the index of the link of its tibia: SA and HA are between foot and tibia.
+FOOT_TO_TIBIA = 2
+
+
 class Sole:
     """Data of one sole. The first two fields are constant. The last four fields change with the motion."""
 

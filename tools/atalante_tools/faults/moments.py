@@ -172,7 +172,8 @@ class MomentTask:
         except Exception as error:  # noqa: BLE001 - any exception of the driver software is a failed check
             return MomentVerdict(self.moment, names, "-", False, None, (exception_sentence(error),))
         extremes, before = _extremes(run, plan.starts), run.last_before_start
-        begins = [run.first + s.start for s in stimuli if s.kind in _MOTOR]
+        motors = _motor_faults(stimuli)
+        begins = [run.first + fault.start for fault in motors]
         restart = before + 1
         in_run = (
             *plan.starts,
@@ -180,8 +181,8 @@ class MomentTask:
         )
         presses = (*in_run, restart, restart + RECOVERY)
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
-        unlimited = [_unlimited(run, cycle, stimuli) for cycle in (*begins, *starts)]
-        failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
+        unlimited = [_unlimited(run, cycle, motors) for cycle in (*begins, *starts)]
+        failures = [*limit_violations(run, unlimited, _strength(motors)), *_premature(run, plan.starts[0])]
         # The check `automatic_improvements` requires that no fault delays the reception of START.
         # At BOOT and READY, the fault begins before the first START, and may delay the effect of START.
         if self.moment not in (Moment.BOOT, Moment.READY):
@@ -238,31 +239,38 @@ def _observe(case: Case, plan: Schedule) -> Observation:
     return case_run.observation(restart)
 
 
-def _unlimited(run: Observation, begin: int, stimuli: Sequence[Stimulus]) -> range:
+def _motor_faults(stimuli: Sequence[Stimulus]) -> list[Fault]:
+    """Return the motor faults of a run.
+
+    Args:
+        stimuli: faults and actions of the run.
+    """
+    return [stimulus for stimulus in stimuli if isinstance(stimulus, Fault) and stimulus.kind in _MOTOR]
+
+
+def _unlimited(run: Observation, begin: int, motors: Sequence[Fault]) -> range:
     """Return the cycles in which no joint speed is checked: `FOUND` cycles with data of the faulty motors, from `begin` on.
 
     Args:
         run: observation of the run.
         begin: first cycle: a motor fault begins, or the operator presses START.
-        stimuli: faults and actions of the run.
+        motors: motor faults of the run.
     """
-    drives = [s.target for s in stimuli if isinstance(s, Fault) and s.kind in _MOTOR]
-    columns = [run.messages.index(f"{drive}_STATE") for drive in drives]
+    columns = [run.messages.index(f"{fault.target}_STATE") for fault in motors]
     seen = np.flatnonzero((run.age[begin - 1 :, columns] < _SILENT).all(axis=1))
     return range(begin, begin + int(seen[FOUND - 1]) + 1 if len(seen) >= FOUND else run.last + 1)
 
 
-def _strength(stimuli: Sequence[Stimulus]) -> Vector:
+def _strength(motors: Sequence[Fault]) -> Vector:
     """Return the factor by which motor faults can increase the torque of each motor, at least 1, shape (12,).
 
     Args:
-        stimuli: faults and actions of the run.
+        motors: motor faults of the run.
     """
     strength = np.ones(len(JOINTS))
-    for stimulus in stimuli:
-        if isinstance(stimulus, Fault) and stimulus.kind in _MOTOR:
-            joint = DRIVE_NODES.index(stimulus.target)
-            strength[joint] = max(strength[joint], abs(float(stimulus["share"])))
+    for fault in motors:
+        joint = DRIVE_NODES.index(fault.target)
+        strength[joint] = max(strength[joint], abs(float(fault["share"])))
     return strength
 
 
