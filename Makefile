@@ -5,28 +5,39 @@ OUT ?= runs
 # The demo and the tests start many processes, so modules must be compiled only once.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test test-long compile test-vcan lowest fuzz coverage mutation lint docs bench messages supervisor-table clean
+.PHONY: help demo demo-air test test-long compile compile-air compile-ground test-vcan lowest fuzz coverage mutation lint docs bench messages supervisor-table clean
 
 help: ## list all targets (default)
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
+# The first run compiles the numeric functions. It compiles those of the walk on the ground on a second core meanwhile.
 demo: .venv/installed-all ## walk in the air inside each guide shape, then on the ground, on the emulated robot
-	$(BIN)/atalante demo --out $(OUT)/demo
+	@$(MAKE) --no-print-directory -j 2 demo-air compile-ground
 	$(BIN)/atalante walk --steps 4 --xi 0.5 --wearer passive --out $(OUT)/walk
+
+demo-air: .venv/installed-all
+	$(BIN)/atalante demo --steps 6 --out $(OUT)/demo
 
 # Two short runs compile the numeric functions while `lint` runs, so the tests do not compile them in every process.
 # With worksteal, the tests of a file mostly run in one worker, so their shared fixtures are created only once.
 test: .venv/installed-dev ## run `lint` and all tests except the long ones and those that need SocketCAN
-	$(MAKE) --no-print-directory -j 2 lint compile
+	$(MAKE) --no-print-directory -j 2 lint compile-air compile-ground
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not (long or exhaustive)"
 
 test-long: .venv/installed-dev ## run the long tests: all cases of the fault matrix, exhaustive searches, walks of many steps, the commands of all pages
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "long or exhaustive"
 
-compile: .venv/installed-all ## compile the numeric functions, which the first run of a command does otherwise
-	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
-	  { $(BIN)/atalante demo --shape pinched --steps 1 --out "$$folder/air" && \
-	    $(BIN)/atalante walk --steps 1 --out "$$folder/ground"; } >"$$folder/log" 2>&1 || { cat "$$folder/log"; exit 1; }
+compile: compile-air compile-ground ## compile the numeric functions, which the first run of a command does otherwise
+
+compile-air: .venv/installed-all
+	@$(call quiet,demo --shape pinched --steps 1)
+
+compile-ground: .venv/installed-all
+	@$(call quiet,walk --steps 1)
+
+# Run a command of `atalante` whose output only matters if the command fails.
+quiet = folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
+  $(BIN)/atalante $(1) --out "$$folder/run" >"$$folder/log" 2>&1 || { cat "$$folder/log"; exit 1; }
 
 test-vcan: .venv/installed-vcan ## run the tests that need SocketCAN, in a virtual machine if this kernel has no SocketCAN
 	PYTHON=$(BIN)/python tests/vcan/run.sh

@@ -59,6 +59,7 @@ def test_robot_is_suspended_above_the_floor_until_active(body: Body) -> None:
     assert np.abs(body.motion("pelvis").attitude[:2]).max() < 0.02
 
 
+@pytest.mark.sample(3)
 def test_robot_is_lowered_in_active_and_then_stands_alone(body: Body) -> None:
     crane = Crane(body)
     run(body, crane, 0.2)
@@ -90,6 +91,7 @@ def test_crane_does_not_lower_the_robot_after_the_end_of_the_hal(network: Networ
     body.close()
 
 
+@pytest.mark.sample(3)
 def test_robot_is_lifted_at_its_current_position(body: Body) -> None:
     crane = Crane(body, automatic=False)
     run(body, crane, 1.0, SupervisorState.ACTIVE)

@@ -107,6 +107,7 @@ class TestNode:
     def test_sends_no_emergency_without_a_fault(self, node: str, run: Run, of) -> None:
         assert of(run(), "EMCY") == []
 
+    @pytest.mark.sample(3)
     def test_every_frame_has_valid_length_flags_e2e_and_ranges(
         self, node: str, run: Run, network: Network, database: Database
     ) -> None:
@@ -134,6 +135,7 @@ class TestNode:
         assert emergencies == [(EMERGENCY, 0x5000), (EMERGENCY + DURATION, 0)]
         assert len(of(frames, "STATE")) == len(of(run(), "STATE"))
 
+    @pytest.mark.sample(3)
     def test_sends_nothing_during_a_reset_and_one_bootup_after_it(
         self, node: str, run: Run, of, database: Database
     ) -> None:
@@ -146,6 +148,7 @@ class TestNode:
         assert boot.payload[2] == 0
         assert of(frames, "STATE")[-1].cycle >= CYCLES - 10
 
+    @pytest.mark.sample(3)
     def test_silent_node_does_not_change_the_frames_of_other_nodes(self, node: str, run: Run, network: Network) -> None:
         own = {m.frame_id for m in network.sent_by(node)}
         silent = run(Fault("silence", node))

@@ -157,6 +157,7 @@ def test_signal_before_the_first_cycle_ends_the_command(point: str, number: int,
 
 
 @pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.sample(2)
 def test_signal_in_the_cycle_before_active_prevents_the_start(
     number: signal.Signals, first_active: int, tmp_path: Path
 ) -> None:

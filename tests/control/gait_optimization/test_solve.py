@@ -110,6 +110,7 @@ def test_step_out_of_reach_is_rejected_without_iterations() -> None:
     assert outcome.status.startswith(f"no such gait for {subject}: with both feet flat on the ground")
 
 
+@pytest.mark.long
 def test_infeasible_gait_names_the_violated_constraint() -> None:
     outcome = solve(Subject(Patient(75.0, 1.75), 0.4, 0.4))
     assert not outcome.solved

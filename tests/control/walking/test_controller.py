@@ -83,6 +83,7 @@ def test_patient_walks_from_standing_to_standing(engine: str) -> None:
     assert controller.max_dcm_error < 0.03
 
 
+@pytest.mark.long
 def test_second_walk_starts_without_the_footprints_of_the_first_and_with_the_load_that_the_feet_carry() -> None:
     controller = WalkController(ROBOT, PATIENT, WALK, 1)
     body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
@@ -282,6 +283,7 @@ def test_stance_leg_replaces_both_lost_trunk_imus_until_they_return(lost: tuple[
         assert controller._observer.rotation[2] == pytest.approx(vertical, abs=1e-3)
 
 
+@pytest.mark.long
 def test_change_between_pelvis_imu_and_torso_imu_in_a_step_keeps_the_attitude() -> None:
     """The pelvis IMU is lost in the middle of the first periodic step and returns in the next step."""
     controller, errors = WalkController(ROBOT, PATIENT, WALK, 2), list[float]()
@@ -536,6 +538,7 @@ def test_count_of_the_cycles_outside_falls_in_a_step_without_a_guide() -> None:
     assert not any(left[3])
 
 
+@pytest.mark.long
 def test_vibration_shows_the_tracking_errors_of_the_guided_leg() -> None:
     controller = RecordingController(ROBOT, PATIENT, WALK, 2)
     controller.felt = []

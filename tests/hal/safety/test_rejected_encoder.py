@@ -80,6 +80,7 @@ def reaction(rig, code: str) -> tuple[int, float]:
     ],
     ids=["fault", "hot", "too hot", "over-current"],
 )
+@pytest.mark.sample(5)
 def test_f87_fault_of_a_drive_has_its_reaction_despite_rejected_encoder_values(
     make_rig, rejection, marked, cause, code, state
 ):

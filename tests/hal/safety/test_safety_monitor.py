@@ -875,6 +875,7 @@ def test_press_in_off_has_no_effect_in_ready(make_rig, cycles: int):
 
 @pytest.mark.parametrize("frames", HEAD_STARTS)
 @pytest.mark.parametrize("state", [S.READY, S.HOLD])
+@pytest.mark.sample(3)
 def test_press_after_a_pendant_loss_counts_from_the_second_frame(make_rig, state: S, frames: int):
     rig = make_rig(starts=False)
     into(rig, state)
@@ -889,6 +890,7 @@ def test_press_after_a_pendant_loss_counts_from_the_second_frame(make_rig, state
 
 @pytest.mark.parametrize("late", HEAD_STARTS)
 @pytest.mark.parametrize("state", [S.READY, S.HOLD, S.FAULT])
+@pytest.mark.sample(5)
 def test_press_before_the_first_pendant_frame_starts_nothing(make_rig, state: S, late: int):
     rig = make_rig(starts=False)
     into(rig, state)
@@ -1051,6 +1053,7 @@ def test_f58_second_sender_of_any_node_leads_to_hold_within_five_cycles(make_rig
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("radians", [0.3, 3e-3])
+@pytest.mark.sample(3)
 def test_f58_second_drive_leads_to_hold_and_prevents_ready(make_rig, order: str, radians: float):
     message = load().message("LEFT_SK_STATE")
     off = round(radians * 100.0 / message.signal("Position").factor)  # on the motor side

@@ -191,6 +191,7 @@ def refusals(rig) -> list[str]:
 
 @joints
 @pytest.mark.parametrize("torque", [-400.0, 3.0])
+@pytest.mark.sample(5)
 def test_torque_of_a_disabled_drive_refuses_the_start(make_rig, joint: int, torque: float):
     rig = make_rig(starts=False)
     signal = FalseSignal(rig, JOINTS[joint], "Torque")

@@ -46,6 +46,7 @@ def stop_during_the_test(rig, joint: int) -> None:
 
 
 @pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
+@pytest.mark.sample(3)
 def test_start_with_a_reversed_motor_fails_and_names_the_joint(make_rig, joint: int):
     rig = make_rig(starts=False)
     rig.emulator.drives.motors.set_strength(joint, -1.0)
@@ -111,6 +112,7 @@ def test_stop_during_the_test_ends_it_in_the_same_cycle(make_rig, stop: str):
 
 
 @pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
+@pytest.mark.sample(3)
 def test_reversed_motor_does_not_hold_if_the_first_start_is_stopped(make_rig, joint: int):
     rig = make_rig(starts=False)
     rig.emulator.drives.motors.set_strength(joint, -1.0)
@@ -205,6 +207,7 @@ def test_restart_from_hold_tests_all_joints_again(rig, held: int):
 
 
 @pytest.mark.parametrize("held", [1, 5, 10, 15, 20, 40])
+@pytest.mark.sample(3)
 def test_start_in_hold_switches_off_no_drive_although_a_joint_moves(rig, held: int):
     rig.until(S.ACTIVE)
     torque = np.zeros(12)

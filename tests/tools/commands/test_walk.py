@@ -31,6 +31,7 @@ def test_patient_walks_three_steps_and_stands(engine: str) -> None:
     assert abs(result["yaw_deg"]) < 5.0
 
 
+@pytest.mark.long
 def test_walk_with_a_heading_reference_stands() -> None:
     code, out, errors = run("--steps", "2", "--engine", "mujoco", "--json", "--heading-reference")
     result = json.loads(out)
@@ -121,6 +122,7 @@ def test_passive_wearer_walks_inside_the_certified_guide(tmp_path: Path) -> None
     assert counts > 8 * 100
 
 
+@pytest.mark.long
 def test_protocol_lowers_the_assistance_step_by_step() -> None:
     arguments = ("--protocol", "1,1,2", "--xi", "0.5", "--wearer", "passive", "--engine", "mujoco", "--json")
     code, out, errors = run(*arguments)
@@ -179,7 +181,7 @@ def test_dial_falls_linearly_from_full_assistance(full: int) -> None:
     assert factors == ([1.0] * full + [0.8, 0.6, 0.4, 0.2, 0.2, 0.2, 0.2])[:8]
 
 
-@pytest.mark.sample(2)
+@pytest.mark.long
 @pytest.mark.parametrize("xi", ["1", "0.5"])
 def test_literal_law_of_the_paper_falls_without_an_operator(xi: str) -> None:
     code, out, _ = run("--literal", "--steps", "10", "--xi", xi, "--engine", "mujoco", "--json")

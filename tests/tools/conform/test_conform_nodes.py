@@ -38,6 +38,7 @@ def test_emulated_node_passes_every_requirement(node: str, make_setup: MakeSetup
 
 
 @pytest.mark.parametrize("node", ["LEFT_SH", *KINDS])
+@pytest.mark.sample(3)
 def test_no_requirement_passes_without_a_frame_of_the_node(node: str, make_setup: MakeSetup):
     setup = make_setup(node)
     setup.wire.from_node = lambda frame: wire.NO_FRAME

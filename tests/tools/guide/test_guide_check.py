@@ -63,6 +63,7 @@ def test_step_without_a_push_stays_in_the_guide_and_is_repeatable():
     np.testing.assert_array_equal(first.log, second.log)
 
 
+@pytest.mark.long
 def test_push_stays_in_its_box_and_follows_its_feedback():
     leg, start = IdealLeg(setup(), controller("constant"), 0.5), starts_of(setup().config, 0)[3]
     feedback = np.zeros((2, FEATURES))
@@ -78,6 +79,7 @@ def test_push_stays_in_its_box_and_follows_its_feedback():
 
 
 @pytest.mark.parametrize(("shape", "xi"), [("constant", 0.0), ("constant", 0.5), ("pinched", 0.5), ("narrowing", 0.9)])
+@pytest.mark.long
 def test_certified_guide_keeps_its_promise_on_every_plant(shape: str, xi: float):
     verdict = promise_check.check(setup(), controller(shape), xi, Task(conditions_of(()), QUICK, seed=0)).verdict
     assert verdict.certified
@@ -89,6 +91,7 @@ def test_certified_guide_keeps_its_promise_on_every_plant(shape: str, xi: float)
 
 @pytest.mark.parametrize("intensity", [0.0, 1.0])
 @pytest.mark.parametrize(("shape", "xi"), [("constant", 0.9), ("narrowing", 0.5)])
+@pytest.mark.long
 def test_promise_does_not_depend_on_idealization_and_feedforward(shape: str, xi: float, intensity: float):
     one = setup_of(None, load_robot(), AirwalkConfig(idealization=intensity, feedforward=intensity))
     task = Task(conditions_of(["both"]), replace(QUICK, steps=30), seed=0)
@@ -100,6 +103,7 @@ def test_promise_does_not_depend_on_idealization_and_feedforward(shape: str, xi:
     assert 0.5 < verdict.worst_ratio <= 1.0
 
 
+@pytest.mark.long
 def test_adversary_leaves_a_guide_with_a_push_far_beyond_its_promise():
     task = Task([Condition()], QUICK, seed=0, push=(200.0, 120.0))
     verdict = promise_check.check(setup(), controller("constant"), 0.5, task).verdict
@@ -128,6 +132,7 @@ def test_robot_walks_under_pushes_in_every_condition(condition: Condition):
         assert setup().gait.cycles - 2 <= len(step.log) <= setup().gait.cycles + 1
 
 
+@pytest.mark.long
 def test_strong_push_on_the_robot_leaves_the_guide():
     push = Push(np.ones((setup().gait.cycles + 1, 2)), NONE)
     walk = PushedRobot(setup(), controller("constant"), 0.5).walk((150.0, 0.0), [push], Condition(), 2, seed=0)
@@ -147,6 +152,7 @@ def test_network_has_a_gait_for_every_patient(subject: Subject):
     assert gait.feedforward is not None
 
 
+@pytest.mark.long
 def test_effort_of_a_check_adds_robot_steps_and_tightness():
     task = Task(conditions_of(["model"]), Effort(steps=20, robot_steps=2, tightness=True), seed=0)
     verdict = promise_check.check(setup(), controller("constant"), 0.5, task).verdict
@@ -191,6 +197,7 @@ def test_command_prints_the_promise_beside_the_worst_ratio(tmp_path: Path):
     )
 
 
+@pytest.mark.long
 def test_command_states_that_the_literal_law_has_no_promise():
     arguments = ["guide", "check", "--shape", "constant", "--xi", "0.5", "--literal", "--quick", "--steps", "20"]
     done = CliRunner().invoke(cli, arguments)
@@ -258,6 +265,7 @@ def test_interrupted_check_is_resumed_from_its_results(tmp_path: Path, monkeypat
         ("TASK\n{}\n", "line 2 of .* must be the verdict"),
     ],
 )
+@pytest.mark.long
 def test_results_of_another_task_are_not_mixed_in(tmp_path: Path, content: str, error: str):
     checked_in_turn(tmp_path, "--steps", "5", "--xi", "0.5")
     results = tmp_path / "results.jsonl"
@@ -272,6 +280,7 @@ def test_results_of_another_task_are_not_mixed_in(tmp_path: Path, content: str, 
 
 
 @pytest.mark.parametrize("end", [0, 9, -20, -1])
+@pytest.mark.long
 def test_line_that_a_killed_check_cut_off_is_checked_again(end: int, tmp_path: Path):
     first = checked_in_turn(tmp_path, "--steps", "5", "--xi", "0.5")
     results = tmp_path / "results.jsonl"

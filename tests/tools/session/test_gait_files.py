@@ -38,13 +38,8 @@ def atalante(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([ATALANTE, *arguments], capture_output=True, text=True, timeout=300, cwd=folder)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a gait, a walk and a start step of `atalante gait solve`, and a network for fewer patients."""
-    made = tmp_path_factory.mktemp("gaits")
-    for kind in ("periodic", "walk", "start"):
-        done = atalante("gait", "solve", *PATIENT, "--kind", kind, "--out", f"{kind}.json", folder=made)
-        assert done.returncode == 0, done.stderr
+def write_network(folder: Path) -> None:
+    """Write network.npz: the network of the package, but only for patients of 60 to 70 kg."""
     network = load_network()
     low, high = network.low.copy(), network.high.copy()
     low[0], high[0] = 60.0, 70.0
@@ -53,7 +48,29 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     weights = first.weights * (new_span / old_span)[:, None]
     bias = first.bias + ((low + high - network.low - network.high) / old_span) @ first.weights
     layers = (first._replace(weights=weights, bias=bias), *network.layers[1:])
-    save_network(replace(network, low=low, high=high, layers=layers), made / "network.npz")
+    save_network(replace(network, low=low, high=high, layers=layers), folder / "network.npz")
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a gait and a walk of `atalante gait solve`, and a network for fewer patients."""
+    made = tmp_path_factory.mktemp("solved")
+    for kind in ("periodic", "walk"):
+        done = atalante("gait", "solve", *PATIENT, "--kind", kind, "--out", f"{kind}.json", folder=made)
+        assert done.returncode == 0, done.stderr
+    write_network(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the walk of the package, two of its steps as gaits, and a network for fewer patients."""
+    made = tmp_path_factory.mktemp("gaits")
+    walk = load_walk(DEFAULT_WALK, ROBOT)
+    write_walk(walk, made / "walk.json")
+    write_gait(walk.step, made / "periodic.json")
+    write_gait(walk.start, made / "start.json")
+    write_network(made)
     return made
 
 
@@ -67,13 +84,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ids=["walk file", "gait file", "network"],
 )
 @pytest.mark.long
-def test_walk_to_the_end_with_the_given_gait(folder: Path, options: tuple[str, ...]) -> None:
-    done = atalante("walk", *WALKED, *options, "--out", "walked", folder=folder)
+def test_walk_to_the_end_with_the_given_gait(solved: Path, options: tuple[str, ...]) -> None:
+    done = atalante("walk", *WALKED, *options, "--out", "walked", folder=solved)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert (result["outcome"], result["steps"]) == ("stood", 2)
     assert result["distance_m"] == pytest.approx(3 * 0.15, abs=0.05)
-    given = json.loads((folder / "walked" / "summary.json").read_text())["options"]
+    given = json.loads((solved / "walked" / "summary.json").read_text())["options"]
     assert given[options[0].removeprefix("--")] == options[1]
 
 
@@ -84,22 +101,22 @@ def test_walk_to_the_end_with_the_given_gait(folder: Path, options: tuple[str, .
     ids=["walk file", "gait file", "network"],
 )
 @pytest.mark.long
-def test_walk_in_the_air_to_the_end_with_the_given_gait(folder: Path, command: str, options: tuple[str, ...]) -> None:
+def test_walk_in_the_air_to_the_end_with_the_given_gait(solved: Path, command: str, options: tuple[str, ...]) -> None:
     run = ("--shape", "pinched", "--steps", "2", "--out", "flown", "--json")
-    done = atalante(command, *run, *options, folder=folder)
+    done = atalante(command, *run, *options, folder=solved)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout.splitlines()[0])
     assert result["certified"]
     assert (result["steps"], result["inside"]) == (2, 1.0)
     assert "66 kg, 1.68 m, step 0.15 m in 0.9 s; the exoskeleton is empty" in done.stderr
-    given = json.loads((folder / "flown" / "summary.json").read_text())
+    given = json.loads((solved / "flown" / "summary.json").read_text())
     assert given[options[0].removeprefix("--")] == options[1]
 
 
 @pytest.mark.long
-def test_gait_file_adjusts_the_exoskeleton_to_its_patient(folder: Path) -> None:
+def test_gait_file_adjusts_the_exoskeleton_to_its_patient(solved: Path) -> None:
     for name in ("walk.json", "periodic.json"):
-        files = GaitFiles(gait=folder / name)
+        files = GaitFiles(gait=solved / name)
         exoskeleton, gait, _ = gait_in_the_air(files, None, ROBOT)
         assert exoskeleton == exoskeleton.fitted(Patient(66.0, 1.68))
         assert patient_of_files(files, None, ROBOT) == Patient(
@@ -107,8 +124,8 @@ def test_gait_file_adjusts_the_exoskeleton_to_its_patient(folder: Path) -> None:
         )
         assert gait.duration == 0.9
     heavier = Patient(70.0, 1.7)
-    assert patient_of_files(GaitFiles(gait=folder / "walk.json"), heavier, ROBOT) == heavier
-    assert patient_of_files(GaitFiles(network=folder / "network.npz"), heavier, ROBOT) == heavier
+    assert patient_of_files(GaitFiles(gait=solved / "walk.json"), heavier, ROBOT) == heavier
+    assert patient_of_files(GaitFiles(network=solved / "network.npz"), heavier, ROBOT) == heavier
 
 
 def test_gait_without_patient_walks_in_the_air_as_without_the_option() -> None:

@@ -69,6 +69,7 @@ def test_low_supply_in_a_step_ends_in_hold_on_both_feet() -> None:
     ],
     ids=["weight shift", "step"],
 )
+@pytest.mark.sample(2)
 def test_stop_of_the_pendant_in_a_walk_ends_it_on_both_feet(
     begins: Callable[[WalkController], bool], finishing: list[Phase]
 ) -> None:

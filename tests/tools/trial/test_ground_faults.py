@@ -160,6 +160,7 @@ def test_help_and_report_state_the_number_of_moments() -> None:
         assert "With --quick, there are two moments" in words
 
 
+@pytest.mark.long
 def test_command_injects_a_fault_and_writes_the_report(tmp_path: Path) -> None:
     arguments = ["trial", "faults", "F05", "--quick", "--jobs", "1", "--out", str(tmp_path), "--json"]
     outcome = CliRunner().invoke(cli, arguments)

@@ -515,6 +515,7 @@ def test_largest_push_is_the_last_one_before_the_robot_falls(monkeypatch: pytest
     assert largest_push(replace(trial, forces=(50.0,)))["end"] == "stood"
 
 
+@pytest.mark.long
 def test_robot_withstands_a_push_at_the_landing_that_moves_the_dcm_over_the_new_stance_foot() -> None:
     trial = PushTrial(90.0, 0.875, (200.0,), 75.0, 1.75, 0, "mujoco")
     assert largest_push(trial)["end"] == "stood"

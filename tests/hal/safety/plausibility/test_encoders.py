@@ -146,6 +146,7 @@ class TestEncoderJump:
 
     @joints
     @signs
+    @pytest.mark.sample(5)
     def test_permanent_offset_is_never_accepted(self, joint: int, sign: float):
         """The joint is at rest, or moves back to where the jump began. The test lasts longer than this motion."""
         size = 12.0 * REACH[joint]
@@ -404,6 +405,7 @@ class TestRange:
 class TestVelocity:
     @joints
     @signs
+    @pytest.mark.sample(5)
     def test_velocity_error_beyond_threshold_is_reported_within_64_cycles(self, joint: int, sign: float):
         error = ROBOT.sensors.velocity_error
         for phase in (0, 3, 15):

@@ -161,6 +161,7 @@ class TestDrift:
 
     @joints
     @signs
+    @pytest.mark.sample(5)
     def test_encoder_offset_beyond_threshold_is_reported_as_drift(self, joint: int, sign: float):
         allowed = ROBOT.sensors.attitude_error
         robot = SimulatedRobot(amplitude=0.0)
@@ -751,6 +752,7 @@ class TestHeading:
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("tilt", TILTS)
     @signs
+    @pytest.mark.sample(7)
     def test_heading_drift_is_not_reported_and_later_drifts_of_encoders_are(
         self, leg: int, tilt: tuple[float, float], sign: float
     ):
@@ -820,6 +822,7 @@ class TestStandingEncoder:
 
     @joints
     @pytest.mark.parametrize("phase", [0, 9, 24])
+    @pytest.mark.sample(7)
     def test_stuck_encoder_is_found_without_torque(self, joint: int, phase: int):
         robot = SimulatedRobot(amplitude=0.1)
         robot.run(200 + phase, lambda now: now.torque.fill(0.0))

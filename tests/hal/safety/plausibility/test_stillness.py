@@ -346,6 +346,7 @@ class TestRepeatedForce:
     @cells
     @pytest.mark.parametrize("axis", range(3))
     @pytest.mark.parametrize("value", [0.0, 400.0])
+    @pytest.mark.sample(7)
     def test_cell_that_repeats_its_force_is_set_to_zero(self, foot: int, cell: int, axis: int, value: float):
         robot = SimulatedRobot()
         robot.run(21)

@@ -195,6 +195,7 @@ def test_all_lines_before_a_truncated_line_are_checked(good: Path) -> None:
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # asammdf leaves a damaged file open
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".mf4", ".log", ".csv"])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.97])
+@pytest.mark.sample(3)
 def test_truncated_log_is_reported(suffix: str, share: float, tmp_path: Path) -> None:
     path = write(tmp_path / f"night{suffix}", MESSAGES)
     whole = path.read_bytes()
@@ -225,6 +226,7 @@ def test_blf_log_that_was_not_closed_is_reported_as_incomplete(suffix: str, tmp_
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".trc", ".csv"])
 @pytest.mark.parametrize("content", [b"", b"\n", b"no log at all\n", bytes(range(256)) * 20])
+@pytest.mark.sample(5)
 def test_file_without_frames_is_reported(suffix: str, content: bytes, tmp_path: Path) -> None:
     path = tmp_path / f"strange{suffix}"
     path.write_bytes(content)
