@@ -687,6 +687,27 @@ class TestErrors:
         assert not bench.drives.latched[7]
         bench.enable()
 
+    @pytest.mark.parametrize("left_to", [DriveState.SWITCHED_ON, DriveState.SWITCH_ON_DISABLED])
+    def test_quick_stop_unlatches_a_drive_without_power_but_does_not_end_its_lasting_error(
+        self, bench: DriveBench, left_to: DriveState
+    ) -> None:
+        bench.enable()
+        bench.drives.leave(7, left_to)
+        bench.drives.supply(7, 30.0)
+        bench.word[7] = Controlword.QUICK_STOP
+        for _ in range(5):
+            bench.cycle()
+        assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.SWITCH_ON_DISABLED, False)
+        for _ in range(5):
+            bench.word[7] = controlword_towards_operation(bench.drives.state[7])
+            bench.cycle()
+        assert bench.drives.state[7] is DriveState.SWITCHED_ON
+        assert [e.code for e in bench.drives.emergencies] == [0x3220]
+        bench.drives.supply(7, 48.0)
+        bench.cycle()
+        assert bench.drives.state[7] is DriveState.OPERATION_ENABLED
+        assert [e.code for e in bench.drives.emergencies] == [0x3220, 0]
+
     @pytest.mark.parametrize("left_to", [DriveState.OPERATION_ENABLED, DriveState.FAULT_REACTION_ACTIVE])
     def test_drive_that_stays_enabled_or_faults_is_not_latched(self, bench: DriveBench, left_to: DriveState) -> None:
         bench.enable()
