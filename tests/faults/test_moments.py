@@ -173,6 +173,16 @@ def test_a_wrong_motor_may_move_a_joint_fast_until_it_is_found(
     assert len(patched(monkeypatch, fast, MOTOR_IN_HOLD).failures) == failures
 
 
+def test_a_wrong_motor_may_not_move_a_joint_of_the_other_leg_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = begin_of_motor_fault() + moments.FOUND // 2 - 1
+
+    def fast(run: Observation) -> None:
+        run.velocity[row, :] = 1.25 * run.robot.velocity_max
+
+    (failure,) = patched(monkeypatch, fast, MOTOR_IN_HOLD).failures
+    assert failure == f"a joint was above its velocity limit: right_FH in cycle {row + 1}"
+
+
 @pytest.mark.parametrize(("cycle", "failures"), [(moments.FOUND + 29, 0), (moments.FOUND + 30, 1)])
 def test_cycles_without_data_of_a_wrong_motor_do_not_count_until_it_is_found(
     monkeypatch: pytest.MonkeyPatch, cycle: int, failures: int

@@ -6,8 +6,8 @@ The fault matrix states the reaction to a fault during a walk. The matrix prescr
 pairs. The runs check what must be true for every fault at every moment:
 
 - No torque, position, velocity or torque rate exceeds its limit. There are two exceptions. For `FOUND` cycles, a faulty motor may
-  move a joint above its velocity limit, because the HAL cannot limit the speed while the drive holds its position. A motor
-  that is too strong may exceed its torque limit by the same share.
+  move the joints of its leg above their velocity limits, because the HAL cannot limit the speed while the drive holds its
+  position. A motor that is too strong may exceed its torque limit by the same share.
 - No command lets a drive produce torque before the operator has pressed START.
 - If the fault begins after START, only the operator can cause a change to a less severe state. Each START
   can cause only one such change.
@@ -28,7 +28,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from atalante_emulator.faults import Fault
-from atalante_hal.robot import JOINTS
+from atalante_hal.robot import JOINTS, LEG_JOINTS
 from atalante_hal.safety.safety_monitor import DRIVE_NODES
 from atalante_hal.safety.start import ENABLE_CYCLES, powered
 from atalante_hal.types import SupervisorState, Vector
@@ -57,9 +57,10 @@ SAG_OF: Final = {
     "value": 5.0,
     "push": math.inf,
 }
-#: Kinds of motor faults. Until the HAL finds a motor fault, a joint may move faster than its velocity limit.
-#: No joint speed is checked for `FOUND` cycles after a motor fault begins, and for `FOUND` cycles after each later START. Cycles
-#: in which the HAL receives no data of the drive do not count, because another fault hides the motor fault (see `_SILENT`).
+#: Kinds of motor faults. Until the HAL finds a motor fault, the joints of its leg may move faster than their velocity limits.
+#: The speeds of these joints are not checked for `FOUND` cycles after the fault begins, and for `FOUND` cycles after each later
+#: START. Cycles in which the HAL receives no data of the drive do not count, because another fault hides the motor fault (see
+#: `_SILENT`).
 _MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
@@ -173,15 +174,13 @@ class MomentTask:
             return MomentVerdict(self.moment, names, "-", False, None, (exception_sentence(error),))
         extremes, before = _extremes(run, plan.starts), run.last_before_start
         motors = _motor_faults(stimuli)
-        begins = [run.first + fault.start for fault in motors]
         restart = before + 1
         in_run = (
             *plan.starts,
             *(run.first + s.start for s in stimuli if isinstance(s, OperatorAction) and s.kind == "start"),
         )
         presses = (*in_run, restart, restart + RECOVERY)
-        starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
-        unlimited = [_unlimited(run, cycle, motors) for cycle in (*begins, *starts)]
+        unlimited = [entry for motor in motors for entry in _unlimited(run, motor, presses)]
         failures = [*limit_violations(run, unlimited, _strength(motors)), *_premature(run, plan.starts[0])]
         # The check `automatic_improvements` requires that no fault delays the reception of START.
         # At BOOT and READY, the fault begins before the first START, and may delay the effect of START.
@@ -248,17 +247,25 @@ def _motor_faults(stimuli: Sequence[Stimulus]) -> list[Fault]:
     return [stimulus for stimulus in stimuli if isinstance(stimulus, Fault) and stimulus.kind in _MOTOR]
 
 
-def _unlimited(run: Observation, begin: int, motors: Sequence[Fault]) -> range:
-    """Return the cycles in which no joint speed is checked: `FOUND` cycles with data of the faulty motors, from `begin` on.
+def _unlimited(run: Observation, motor: Fault, starts: Sequence[int]) -> list[tuple[range, slice]]:
+    """Return the cycles in which the joint speeds of the leg with a motor fault are not checked, with the joints of this leg.
+
+    Each range contains `FOUND` cycles with data of the faulty motor. The ranges begin with the fault and with each later START.
 
     Args:
         run: observation of the run.
-        begin: first cycle: a motor fault begins, or the operator presses START.
-        motors: motor faults of the run.
+        motor: motor fault of the run.
+        starts: cycles in which the operator pressed START.
     """
-    columns = [run.messages.index(f"{fault.target}_STATE") for fault in motors]
-    seen = np.flatnonzero((run.age[begin - 1 :, columns] < _SILENT).all(axis=1))
-    return range(begin, begin + int(seen[FOUND - 1]) + 1 if len(seen) >= FOUND else run.last + 1)
+    begin = run.first + motor.start
+    leg = DRIVE_NODES.index(motor.target) // len(LEG_JOINTS)
+    fresh = run.age[:, run.messages.index(f"{motor.target}_STATE")] < _SILENT
+    found = []
+    for first in (begin, *(start for start in starts if start >= begin)):
+        seen = np.flatnonzero(fresh[first - 1 :])
+        end = first + int(seen[FOUND - 1]) + 1 if len(seen) >= FOUND else run.last + 1
+        found.append((range(first, end), slice(leg * len(LEG_JOINTS), (leg + 1) * len(LEG_JOINTS))))
+    return found
 
 
 def _strength(motors: Sequence[Fault]) -> Vector:

@@ -138,19 +138,21 @@ def reacted(run: Observation, state: SupervisorState) -> int | None:
     return None
 
 
-def limit_violations(run: Observation, unlimited: Sequence[range] = (), strength: Vector | float = 1.0) -> list[str]:
+def limit_violations(
+    run: Observation, unlimited: Sequence[tuple[range, slice]] = (), strength: Vector | float = 1.0
+) -> list[str]:
     """Return a sentence for each limit that a command, a motor or a joint exceeded.
 
     Args:
         run: observation of the run.
-        unlimited: ranges of cycles in which the joint velocities are not checked.
+        unlimited: for each element, the velocities of a slice of the joints are not checked in a range of cycles.
         strength: torque of each motor divided by the torque of a motor without fault, shape (12,), at least 1.
     """
     robot = run.robot
     found = run.commands.violations(robot, run.drive_state)
     fast = np.abs(run.velocity) > _VELOCITY_RATIO * robot.velocity_max
-    for cycles in unlimited:
-        fast[max(cycles.start - 1, 0) : max(cycles.stop - 1, 0)] = False
+    for cycles, joints in unlimited:
+        fast[max(cycles.start - 1, 0) : max(cycles.stop - 1, 0), joints] = False
     for sentence, wrong in (
         ("a motor's torque was above its limit", np.abs(run.torque) > strength * robot.torque_max * (1.0 + 1e-9)),
         ("a joint was outside its position range", run.position > robot.position_max + _OVERSHOOT),
