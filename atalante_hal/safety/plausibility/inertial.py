@@ -13,6 +13,11 @@ a gain that is wrong by a third, and an attitude that is tilted by more than 18 
 must report the same. The mean square of the difference may be at most `_RATE_ERROR` squared plus a share of the mean square of
 the angular velocity. The check detects a wrong sign and exchanged axes as soon as the IMU turns by more than 0.06 rad/s rms.
 
+*Constant reading.* A healthy sensor has noise, and its reading changes when the IMU turns. If one axis of a gyroscope or an
+accelerometer has exactly the same reading in `_CONSTANT` + 1 samples, the attitude must not turn by more than `_TURN` beyond this
+reading: for a gyroscope the turn about the axis minus the integral of the reading, for an accelerometer the change of the
+direction of gravity along the axis. An IMU at rest is never reported. So the check does not depend on the size of the noise.
+
 *Torso and pelvis.* Both IMUs are on one rigid body with equal axes. So their angular velocities and their vertical directions are
 equal. Their headings are not compared, because they drift. If one of the two IMUs fails a check of its own, the comparison is
 omitted.
@@ -57,6 +62,10 @@ _MOVING_RATE = 0.5
 _RATE_ERROR = 0.1
 #: While an IMU turns, its rms difference may be larger: the limit is sqrt(_RATE_ERROR^2 + _RATE_SHARE * mean square of its rate).
 _RATE_SHARE = 0.25
+#: A reading is constant if this number of consecutive samples repeats it exactly.
+_CONSTANT = 4
+#: Largest turn of the attitude that a constant reading may miss [rad].
+_TURN = 0.01
 _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 
 
@@ -85,6 +94,12 @@ class Record(NamedTuple):
     rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2]; rows and columns as in `rate_error`
     #: Mean difference, shape (3,): upward unit vector in torso axes minus upward unit vector in pelvis axes.
     tilt: Vector
+    accel: Vector  # (4, 3) specific force in the last sample [m/s2]
+    #: Number of samples that repeated the reading of each axis, shape (4, 6): gyroscope, then accelerometer.
+    repeats: Vector
+    #: Turn of the attitude that the constant reading of each axis has missed, shape (4, 6) [rad]. If it is beyond its limit, it
+    #: stays until the reading changes.
+    missed: Vector
 
 
 class Excess(NamedTuple):
@@ -93,6 +108,7 @@ class Excess(NamedTuple):
     force: Vector  # (4,) magnitude of the mean difference between specific force and gravity [m/s2]
     rate: Vector  # (5,) largest rms difference in each row of `Record.rate_error` [rad/s]
     tilt: Vector  # (1,) angle between the upward directions of torso and pelvis [rad]
+    missed: Vector  # (4,) largest turn of the attitude that a constant reading has missed [rad]
 
 
 class Inertial:
@@ -111,10 +127,11 @@ class Inertial:
     ) -> None:
         imus = len(IMUS)
         self._new = np.zeros(imus, np.int64)
-        self._excess = Excess(np.zeros(imus), np.zeros(imus + 1), np.zeros(1))
+        self._excess = Excess(np.zeros(imus), np.zeros(imus + 1), np.zeros(1), np.zeros(imus))
         record = Record(
             np.zeros((imus, 4)), np.zeros((imus, 3)), np.full(imus, NEVER), np.zeros(2 * imus + 1), np.zeros((imus, 3)),
             np.zeros((imus + 1, 3)), np.zeros((imus + 1, 3)), np.zeros(3),
+            np.zeros((imus, 3)), np.zeros((imus, 6)), np.zeros((imus, 6)),
         )  # fmt: skip
         self._intervals = itertools.cycle(intervals)
         self._interval = 0  # time since the last call of `evaluate` [cycles]
@@ -186,6 +203,8 @@ def follow(
         if age[imu] >= NEVER:  # the values are too old: another check reports this IMU
             record.force[imu] = 0.0
             record.rate_error[imu] = 0.0
+            record.repeats[imu] = 0.0
+            record.missed[imu] = 0.0
             if imu in (_TORSO, _PELVIS):
                 record.tilt[:] = 0.0
                 record.rate_error[len(age)] = 0.0
@@ -195,6 +214,7 @@ def follow(
             record.quaternion[imu, axis] = now.quaternion[imu, axis]
         for axis in range(3):
             record.gyro[imu, axis] = now.gyro[imu, axis]
+            record.accel[imu, axis] = now.accel[imu, axis]
     if comparable:
         compare(now, record)
     return exceeds(record, excess, tilt_error)
@@ -214,6 +234,7 @@ def add(imu: int, now: Readings, record: Record, time: float) -> None:
     for axis in range(3):
         mean = 0.5 * (record.gyro[imu, axis] + now.gyro[imu, axis])
         add_rates(record, imu, axis, share, (turn[axis], mean))
+    add_missed(imu, now, record, turn, time)
     if turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2 > _MOVING_RATE**2:
         return
     share = count(record, len(record.rate) + imu)
@@ -223,6 +244,53 @@ def add(imu: int, now: Readings, record: Record, time: float) -> None:
     record.force[imu, 0] += scale * x - share * record.force[imu, 0]
     record.force[imu, 1] += scale * y - share * record.force[imu, 1]
     record.force[imu, 2] += scale * z - share * record.force[imu, 2]
+
+
+def add_missed(imu: int, now: Readings, record: Record, turn: tuple[float, float, float], time: float) -> None:
+    """Add the turn since the last sample to the turns that the constant readings of one IMU have missed.
+
+    Args:
+        imu: index of the IMU in IMUS.
+        now: readings of the sample.
+        record: last sample, repeats and missed turns. Updated here.
+        turn: angular velocity since the last sample, from the attitudes [rad/s].
+        time: time since the last sample [s].
+    """
+    # An IMU that repeats its attitude is at rest, or repeats all its values, which another check reports (F32).
+    turned = time if turn[0] != 0.0 or turn[1] != 0.0 or turn[2] != 0.0 else 0.0
+    before, up = upward(record.quaternion[imu]), upward(now.quaternion[imu])
+    for axis in range(3):
+        gyro, accel = now.gyro[imu, axis], now.accel[imu, axis]
+        add_repeat(record, imu, axis, gyro == record.gyro[imu, axis], (turn[axis] - gyro) * turned)
+        add_repeat(record, imu, 3 + axis, accel == record.accel[imu, axis], up[axis] - before[axis])
+
+
+def add_repeat(record: Record, imu: int, axis: int, same: bool, missed: float) -> None:
+    """Count a repeated reading, and add the turn that it has missed. A changed reading sets both to 0.
+
+    Args:
+        record: repeats and missed turns. Updated here.
+        imu: index of the IMU in IMUS.
+        axis: column of `Record.repeats`.
+        same: whether the reading equals the one of the last sample.
+        missed: turn of the attitude since the last sample that the reading does not contain [rad].
+    """
+    if not same:
+        record.repeats[imu, axis] = record.missed[imu, axis] = 0.0
+    elif missed_turn(record, imu, axis) == 0.0:
+        record.repeats[imu, axis] += 1.0
+        record.missed[imu, axis] += missed
+
+
+def missed_turn(record: Record, imu: int, axis: int) -> float:
+    """Return the turn that the reading of one axis has missed [rad]; 0 if it is within its limit or the reading is not constant.
+
+    Args:
+        record: repeats and missed turns.
+        imu: index of the IMU in IMUS.
+        axis: column of `Record.repeats`.
+    """
+    return beyond(abs(record.missed[imu, axis]), _TURN) if record.repeats[imu, axis] >= _CONSTANT else 0.0
 
 
 def compare(now: Readings, record: Record) -> None:
@@ -283,7 +351,10 @@ def exceeds(record: Record, excess: Excess, tilt_error: float) -> bool:
         if record.samples[pair + 1 + imu] >= FIRST_SAMPLES[imu]:
             excess.force[imu] = beyond(math.sqrt(x * x + y * y + z * z), _FORCE_ERROR)
         excess.rate[imu] = wrong_rate(record, imu) if record.samples[imu] >= FIRST_SAMPLES[imu] else 0.0
-        found = found or excess.force[imu] > 0.0 or excess.rate[imu] > 0.0
+        excess.missed[imu] = 0.0
+        for axis in range(6):
+            excess.missed[imu] = max(excess.missed[imu], missed_turn(record, imu, axis))
+        found = found or excess.force[imu] > 0.0 or excess.rate[imu] > 0.0 or excess.missed[imu] > 0.0
     x, y, z = record.tilt[0], record.tilt[1], record.tilt[2]
     enough = record.samples[pair] >= FIRST_SAMPLES[_TORSO]
     excess.tilt[0] = beyond(math.sqrt(x * x + y * y + z * z), tilt_error) if enough else 0.0
@@ -379,13 +450,18 @@ def _findings(excess: Excess, wrong: frozenset[int]) -> tuple[Finding, ...]:
         wrong: result of `_wrong`.
     """
     found = []
-    for imu, (force, rate) in enumerate(zip(excess.force.tolist(), excess.rate.tolist(), strict=False)):
+    values = zip(excess.force.tolist(), excess.rate.tolist(), excess.missed.tolist(), strict=False)
+    for imu, (force, rate, missed) in enumerate(values):
         if force:
             text = f"the accelerometer of the {IMUS[imu]} IMU contradicts gravity in the reported attitude by {force:.1f} m/s2"
             found.append(_finding(imu, force, text))
         elif rate:
             text = f"the gyroscope of the {IMUS[imu]} IMU contradicts the change of its attitude by {rate:.2f} rad/s"
             found.append(_finding(imu, rate, text))
+        elif missed:
+            turn = f"{math.degrees(missed):.1f} degrees"
+            text = f"one axis of the {IMUS[imu]} IMU has a constant reading while its attitude turns by {turn}"
+            found.append(_finding(imu, missed, text))
     if not wrong.isdisjoint((_TORSO, _PELVIS)):
         return tuple(found)
     tilt, rate = float(excess.tilt[0]), float(excess.rate[-1])
@@ -399,7 +475,7 @@ def _findings(excess: Excess, wrong: frozenset[int]) -> tuple[Finding, ...]:
 
 def _wrong(excess: Excess) -> frozenset[int]:
     """Return the indices in IMUS of the IMUs that contradict gravity or their own attitude."""
-    return frozenset(imu for imu in range(len(IMUS)) if excess.force[imu] or excess.rate[imu])
+    return frozenset(imu for imu in range(len(IMUS)) if excess.force[imu] or excess.rate[imu] or excess.missed[imu])
 
 
 def _finding(imu: int, value: float, text: str) -> Finding:

@@ -165,7 +165,7 @@ class TestForce:
                     now.gyro[:] = 0.0
                     now.gyro[:, axis] = rate
                     now.accel[:] = specific_force(now.quaternion[0])
-                    now.accel[imu] = 0.0
+                    now.accel[imu] *= -1.0
 
                 robot.sample(change)
             assert bool(robot.checks.findings()) == found
@@ -175,7 +175,7 @@ class TestRate:
     @imus
     @axes
     @pytest.mark.parametrize(
-        ("gain", "found"), [(-1.0, True), (0.0, True), (0.3, True), (0.7, False), (1.3, False), (1.9, True)]
+        ("gain", "found"), [(-1.0, True), (0.1, True), (0.3, True), (0.7, False), (1.3, False), (1.9, True)]
     )
     def test_wrong_gain_of_a_gyroscope_is_found(self, imu: int, axis: int, gain: float, found: bool):
         robot = Turning(rate=0.4, axis=axis, base=product(turned(0, 1.0), turned(1, -0.7)))
@@ -226,6 +226,147 @@ class TestRate:
         robot = Turning(rate=3.0, axis=2)
         robot.checks = Inertial(ROBOT, robot.now, LIMITS, (40, 40), PERIOD)
         assert any(robot.sample() for _ in range(200))
+
+
+def rotated(now: Signals, axis: int, angle: float) -> None:
+    """Set the attitude of all IMUs, and the readings that healthy IMUs at rest report in this attitude."""
+    now.quaternion[:] = turned(axis, angle)
+    now.gyro[:] = 0.0
+    now.accel[:] = specific_force(now.quaternion[0])
+
+
+class TestConstantReading:
+    @imus
+    @axes
+    @signs
+    @pytest.mark.parametrize("repeats", [3, 4])
+    def test_constant_gyroscope_is_found_while_the_imu_turns_slowly(
+        self, imu: int, axis: int, sign: float, repeats: int
+    ):
+        """The rate is below the limit of the comparison of gyroscope and attitude."""
+        robot, rate, angle = Turning(), sign * 0.09, 0.0
+        robot.now.gyro[:, axis] = rate
+        for sample in range(20):
+            angle += rate * PERIOD * INTERVALS[(sample + 1) % 2]
+
+            def change(now: Signals, sample: int = sample, angle: float = angle) -> None:
+                rotated(now, axis, angle)
+                noise = 0.001 * (sample % 2)
+                now.gyro[:, axis] = rate + noise
+                now.accel[:] += noise
+                if sample > 10:
+                    now.gyro[imu, axis] = -rate if sample <= 11 + repeats else rate + noise
+
+            if robot.sample(change):
+                assert repeats == 4
+                break
+        else:
+            assert repeats == 3
+            return
+        assert sample == 11 + repeats
+        finding = only(robot.checks.findings())
+        assert (finding.dtc, finding.node, finding.confirmed) == (Dtc.IMU_IMPLAUSIBLE, IMU_NODES[imu], True)
+        assert finding.value == pytest.approx(2.0 * 0.09 * PERIOD * (2 * sum(INTERVALS)), rel=1e-3)
+        assert finding.text == (
+            f"one axis of the {IMUS[imu]} IMU has a constant reading while its attitude turns by "
+            f"{math.degrees(finding.value):.1f} degrees"
+        )
+        assert robot.checks.implausible == {imu}
+
+    @imus
+    @axes
+    @signs
+    def test_constant_accelerometer_is_found_when_the_direction_of_gravity_changes(
+        self, imu: int, axis: int, sign: float
+    ):
+        base = product(turned(0, 0.6), turned(1, 0.6))  # gravity has a component along each axis
+        for turn, found in ((0.0099, False), (0.0101, True)):
+            robot = Turning()
+            up = upward(base)
+            other = 1 if axis == 0 else 0
+            start, step, last = up[axis], 0.0, base
+            while abs(upward(last)[axis] - start) < turn:
+                step += 1e-6
+                last = product(base, turned(other, sign * step))
+            for sample in range(10):
+                part = product(base, turned(other, sign * step * max(0, sample - 5) / 4.0))
+                rate = np.eye(3)[other] * (sign * step / (2 * sum(INTERVALS) * PERIOD) if sample > 5 else 0.0)
+
+                def change(
+                    now: Signals, sample: int = sample, part: np.ndarray = part, rate: np.ndarray = rate
+                ) -> None:
+                    now.quaternion[:] = part
+                    noise = 0.001 * (1 + sample % 2)
+                    now.gyro[:] = rate + noise
+                    now.accel[:] = specific_force(part) + noise
+                    if sample >= 5:
+                        now.accel[imu, axis] = specific_force(base)[axis]
+
+                result = robot.sample(change)
+                assert result == (found and sample == 9)
+            if found:
+                finding = only(robot.checks.findings())
+                assert finding.value == pytest.approx(turn, rel=1e-3)
+                assert robot.checks.implausible == {imu}
+
+    @imus
+    def test_finding_stays_until_the_reading_changes(self, imu: int):
+        """The turn back does not end the finding."""
+        robot, angle = Turning(), 0.0
+        for sample in range(40):
+            angle += 0.09 * PERIOD * INTERVALS[(sample + 1) % 2] * (1.0 if sample < 20 else -1.0)
+
+            def change(now: Signals, sample: int = sample, angle: float = angle) -> None:
+                rotated(now, 1, angle)
+                noise = 0.001 * (sample % 2)
+                now.gyro[:, 1] = (0.09 if sample < 20 else -0.09) + noise
+                now.accel[:] += noise
+                now.gyro[imu, 1] = 0.0
+
+            robot.sample(change)
+        assert only(robot.checks.findings()).value == pytest.approx(0.01, abs=0.002)
+
+        def healthy(now: Signals) -> None:
+            now.gyro[:] = 0.0005
+
+        assert not robot.sample(healthy)
+        assert robot.checks.implausible == frozenset()
+
+    @imus
+    def test_imu_at_rest_or_with_a_frozen_attitude_is_not_found(self, imu: int):
+        """An IMU that repeats all its values is reported by another check (F32)."""
+        robot = Turning()
+        robot.now.gyro[imu] = 0.09
+        assert not any(robot.sample(lambda now: now.gyro[imu].fill(0.09)) for _ in range(100))
+
+    @imus
+    def test_changed_reading_ends_the_count_while_the_attitude_is_constant(self, imu: int):
+        robot, angle = Turning(), 0.0
+        for sample in range(60):
+            if sample % 4:
+                angle += 0.09 * PERIOD * INTERVALS[(sample + 1) % 2]
+
+            def change(now: Signals, sample: int = sample, angle: float = angle) -> None:
+                rotated(now, 1, angle)
+                now.gyro[:] = now.accel[imu, 0] = 0.001 * ((sample + 1) // 4 % 2)
+
+            assert not robot.sample(change)
+
+    @imus
+    def test_lost_values_end_the_count(self, imu: int):
+        robot, angle = Turning(), 0.0
+        for sample in range(60):
+            angle += 0.09 * PERIOD * INTERVALS[(sample + 1) % 2]
+            lost = ages(**{IMUS[imu]: NEVER}) if sample % 4 == 3 else None
+
+            def change(now: Signals, sample: int = sample, angle: float = angle) -> None:
+                rotated(now, 1, angle)
+                noise = 0.001 * (sample % 2)
+                now.gyro[:, 1] = 0.09 + noise
+                now.accel[:] += noise
+                now.gyro[imu, 1] = 0.0
+
+            assert not robot.sample(change, lost)
 
 
 class TestPair:
