@@ -15,7 +15,7 @@ demo: .venv/installed-all ## walk in the air inside each guide shape, then on th
 	@$(MAKE) --no-print-directory -j 2 demo-air compile-ground
 	$(BIN)/atalante walk --steps 4 --xi 0.5 --wearer passive --out $(OUT)/walk
 
-demo-air: .venv/installed-all
+demo-air: .venv/installed-all ## run the part of `demo` in the air
 	$(BIN)/atalante demo --steps 6 --out $(OUT)/demo
 
 # Two short runs compile the numeric functions while `lint` runs, so the tests do not compile them in every process.
@@ -29,10 +29,10 @@ test-long: .venv/installed-dev ## run the long tests: all cases of the fault mat
 
 compile: compile-air compile-ground ## compile the numeric functions, which the first run of a command does otherwise
 
-compile-air: .venv/installed-all
+compile-air: .venv/installed-all ## run the part of `compile` for walks in the air
 	@$(call quiet,demo --shape pinched --steps 1)
 
-compile-ground: .venv/installed-all
+compile-ground: .venv/installed-all ## run the part of `compile` for walks on the ground
 	@$(call quiet,walk --steps 1)
 
 # Run a command of `atalante` whose output only matters if the command fails.
