@@ -22,8 +22,9 @@ direction of gravity along the axis. An IMU at rest is never reported. So the ch
 equal. Their headings are not compared, because they drift. If one of the two IMUs fails a check of its own, the comparison is
 omitted.
 
-A sample is skipped if its values are too old, if it is saturated, or if its quaternion has a wrong norm. If the values of an IMU
-are too old, its means are set to 0, because another check reports this fault.
+A sample is skipped if its values are too old, if it is saturated, or if its quaternion has a wrong norm. A reading before a
+skipped sample is not compared with a reading after it. If the values of an IMU are too old, its means are set to 0, because
+another check reports this fault.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ class Record(NamedTuple):
     #: Number of samples that repeated the reading of each axis, shape (4, 6): gyroscope, then accelerometer.
     repeats: Vector
     #: Turn of the attitude that the constant reading of each axis has missed, shape (4, 6) [rad]. If it is beyond its limit, it
-    #: stays until the reading changes.
+    #: stays until the reading changes or the values are too old.
     missed: Vector
 
 
@@ -200,11 +201,13 @@ def follow(
             add(imu, now, record, period * (interval + record.age[imu] - age[imu]))
         elif imu in (_TORSO, _PELVIS):
             comparable = False
+        if not used:
+            for axis in range(6):  # a skipped sample ends the count, but not a finding
+                if age[imu] >= NEVER or missed_turn(record, imu, axis) == 0.0:
+                    record.repeats[imu, axis] = record.missed[imu, axis] = 0.0
         if age[imu] >= NEVER:  # the values are too old: another check reports this IMU
             record.force[imu] = 0.0
             record.rate_error[imu] = 0.0
-            record.repeats[imu] = 0.0
-            record.missed[imu] = 0.0
             if imu in (_TORSO, _PELVIS):
                 record.tilt[:] = 0.0
                 record.rate_error[len(age)] = 0.0

@@ -348,7 +348,7 @@ class TestConstantReading:
 
             def change(now: Signals, sample: int = sample, angle: float = angle) -> None:
                 rotated(now, 1, angle)
-                now.gyro[:] = now.accel[imu, 0] = 0.001 * ((sample + 1) // 4 % 2)
+                now.gyro[:] = now.accel[imu, 0] = 0.001 * (sample // 4 % 2)
 
             assert not robot.sample(change)
 
@@ -367,6 +367,64 @@ class TestConstantReading:
                 now.gyro[imu, 1] = 0.0
 
             assert not robot.sample(change, lost)
+
+    @imus
+    @pytest.mark.parametrize("accelerometer", [False, True])
+    @pytest.mark.parametrize("skipped", ["lost", "saturated", "no attitude", ""])
+    @pytest.mark.parametrize(("before", "after"), [((4, 0.18), (5, 0.03)), ((7, 0.0), (4, 0.3))])
+    def test_skipped_sample_or_another_reading_ends_the_count(
+        self, imu: int, skipped: str, accelerometer: bool, before: tuple[int, float], after: tuple[int, float]
+    ):
+        """The number of equal samples, or the missed turn, exceeds its limit only as the sum before and after this sample."""
+        robot, angle, healthy = Turning(), 0.0, SAMPLES
+        gap = healthy + before[0]
+        for sample in range(gap + 1 + after[0]):
+            rate = 0.0 if sample < healthy else before[1] if sample < gap else 0.0 if sample == gap else after[1]
+            angle += rate * PERIOD * INTERVALS[(sample + 1) % 2]
+
+            def change(now: Signals, sample: int = sample, angle: float = angle, rate: float = rate) -> None:
+                rotated(now, 1, angle)
+                noise = 0.001 * (1 + sample % 2)
+                now.gyro[:, 1] = rate + noise
+                now.accel[:] += noise
+                if sample >= healthy:
+                    constant = 0.0 if sample < gap else 0.01 if sample == gap else 0.004
+                    if accelerometer:
+                        now.accel[imu, 0] = constant
+                    else:
+                        now.gyro[imu, 1] = constant
+                if sample == gap:
+                    skip(now, imu, skipped)
+
+            assert not robot.sample(change, ages(**{IMUS[imu]: NEVER}) if (sample, skipped) == (gap, "lost") else None)
+
+    @imus
+    @pytest.mark.parametrize(("skipped", "until"), [("lost", 20), ("saturated", 22), ("no attitude", 22)])
+    def test_only_lost_values_or_another_reading_end_a_finding(self, imu: int, skipped: str, until: int):
+        robot, angle = Turning(), 0.0
+        for sample in range(23):
+            angle += 0.09 * PERIOD * INTERVALS[(sample + 1) % 2]
+
+            def change(now: Signals, sample: int = sample, angle: float = angle) -> None:
+                rotated(now, 1, angle)
+                noise = 0.001 * (1 + sample % 2)
+                now.gyro[:, 1] = 0.09 + noise
+                now.accel[:] += noise
+                if sample < 20:
+                    now.gyro[imu, 1] = 0.0
+                if sample == 20:
+                    skip(now, imu, skipped)
+
+            found = robot.sample(change, ages(**{IMUS[imu]: NEVER}) if (sample, skipped) == (20, "lost") else None)
+            assert sample < 10 or found == (sample < until)
+
+
+def skip(now: Signals, imu: int, reason: str) -> None:
+    """Change the values of an IMU so that the checks skip this sample for a reason; "lost" changes nothing."""
+    if reason == "saturated":
+        now.accel[imu, 0] = LIMITS.accel_end
+    elif reason == "no attitude":
+        now.quaternion[imu] *= 1.5
 
 
 class TestPair:
