@@ -16,7 +16,8 @@ the angular velocity. The check detects a wrong sign and exchanged axes as soon 
 *Constant reading.* A healthy sensor has noise, and its reading changes when the IMU turns. If one axis of a gyroscope or an
 accelerometer has exactly the same reading in `_CONSTANT` + 1 samples, the attitude must not turn by more than `_TURN` beyond this
 reading: for a gyroscope the turn about the axis minus the integral of the reading, for an accelerometer the change of the
-direction of gravity along the axis. An IMU at rest is never reported. So the check does not depend on the size of the noise.
+direction of gravity along the axis. An IMU whose attitude does not change is never reported. The missed turn does not decay. So
+the check needs noise of at least one code (rms): then a healthy reading is constant for at most 0.3 s.
 
 *Torso and pelvis.* Both IMUs are on one rigid body with equal axes. So their angular velocities and their vertical directions are
 equal. Their headings are not compared, because they drift. If one of the two IMUs fails a check of its own, the comparison is

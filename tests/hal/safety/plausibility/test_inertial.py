@@ -339,6 +339,18 @@ class TestConstantReading:
         robot.now.gyro[imu] = 0.09
         assert not any(robot.sample(lambda now: now.gyro[imu].fill(0.09)) for _ in range(100))
 
+    def test_noise_of_one_code_and_a_constant_error_at_rest_are_accepted(self):
+        """Gyroscope and attitude have the resolution of the DBC, and the attitude changes by one code."""
+        robot, random = Turning(), np.random.default_rng(3)
+        for _ in range(10_000):
+            readings = 0.00125 * np.rint((0.03 / 0.00125) + random.standard_normal((len(IMUS), 3)))
+            attitude = turned(1, 2.0 * 3.05e-5 * random.integers(2))
+
+            def change(now: Signals, readings: np.ndarray = readings, attitude: np.ndarray = attitude) -> None:
+                now.quaternion[:], now.gyro[:] = attitude, readings
+
+            assert not robot.sample(change)
+
     @imus
     def test_changed_reading_ends_the_count_while_the_attitude_is_constant(self, imu: int):
         robot, angle = Turning(), 0.0
