@@ -14,7 +14,7 @@ from atalante_tools.faults.checks import (
     guide_kept,
     left_leg_in_local_hold,
 )
-from atalante_tools.faults.scenario import Case, OperatorAction, Scenario
+from atalante_tools.faults.scenario import Case, OperatorAction, Scenario, invalid_code
 
 _HOLD: Final = SupervisorState.HOLD
 _ACTIVE: Final = SupervisorState.ACTIVE
@@ -24,6 +24,8 @@ _BUSES: Final = ("left_leg", "right_leg", "left_sense", "right_sense")
 _KNEE: Final = "LEFT_SK"
 #: State message of the drive `_KNEE`.
 _STATE: Final = "LEFT_SK_STATE"
+#: Raw code with which this drive reports that it has no position.
+_NO_POSITION: Final = invalid_code(_STATE, "Position")
 #: Message with the command of the drive `_KNEE`.
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 _PENDANT: Final = "PENDANT"
@@ -186,9 +188,9 @@ SCENARIOS: Final = (
         "F12",
         (
             Case("undefined drive state", (Fault("raw", _STATE, 0, 4, DriveState=255),), node=_KNEE),
-            Case("invalid position", (Fault("raw", _STATE, 0, 4, Position=1 << 23),), node=_KNEE),
+            Case("invalid position", (Fault("raw", _STATE, 0, 4, Position=_NO_POSITION),), node=_KNEE),
         ),
-        permanent=Case("permanent", (Fault("raw", _STATE, Position=1 << 23),)),
+        permanent=Case("permanent", (Fault("raw", _STATE, Position=_NO_POSITION),)),
     ),
     Scenario(
         "F13",

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+import atalante_dbc
 from atalante_emulator.faults import Fault
 from atalante_hal.types import SupervisorState
 from atalante_tools.console.options import PYBULLET
@@ -55,6 +56,18 @@ class OperatorAction:
 
 
 Stimulus = Fault | HostFault | OperatorAction
+
+
+def invalid_code(message: str, signal: str) -> int:
+    """Return the unsigned raw code in the DBC with which a node reports that a signal has no value.
+
+    Args:
+        message: name of the message.
+        signal: name of a signal with such a code.
+    """
+    code = atalante_dbc.load().message(message).signal(signal).invalid_raw
+    assert code is not None
+    return code
 
 
 def shifted(stimulus: Stimulus, cycles: int) -> Stimulus:

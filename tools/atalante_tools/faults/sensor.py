@@ -9,7 +9,7 @@ from atalante_emulator.faults import Fault
 from atalante_hal.robot import CELLS, FEET, IMUS
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import start_is_rejected
-from atalante_tools.faults.scenario import MID_SWING, Case, OperatorAction, Scenario
+from atalante_tools.faults.scenario import MID_SWING, Case, OperatorAction, Scenario, invalid_code
 
 _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
@@ -101,9 +101,6 @@ def _never_ready(name: str, fault: Fault, *, node: str) -> Case:
         checks=(start_is_rejected,),
     )
 
-
-#: Raw value of the CAN signal Position with which a drive reports an invalid position.
-_INVALID_CODE: Final = 1 << 23
 
 SCENARIOS: Final = (
     Scenario(
@@ -360,7 +357,7 @@ SCENARIOS: Final = (
         (
             Case(
                 "every second position of a joint is invalid",
-                _every(2, "raw", f"{_STILL}_STATE", 40, Position=_INVALID_CODE),
+                _every(2, "raw", f"{_STILL}_STATE", 40, Position=invalid_code(f"{_STILL}_STATE", "Position")),
                 node=_STILL,
             ),
             Case(

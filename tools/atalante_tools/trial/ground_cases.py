@@ -8,11 +8,8 @@ from atalante_emulator.faults import Fault
 from atalante_hal.robot import CELLS
 from atalante_hal.safety.plausibility.finding import FOOT_NODES, TRUNK_NODES
 from atalante_tools.faults.catalogue import SCENARIOS
-from atalante_tools.faults.scenario import MID_SWING, Case, HostFault
+from atalante_tools.faults.scenario import MID_SWING, Case, HostFault, invalid_code
 from atalante_tools.trial.fault_plan import PERMANENT
-
-#: Invalid code of the signals `<cell>_ForceZ` in the DBC (raw value).
-_INVALID_FORCE: Final = -0x8000
 
 
 def _no_load(*feet: str) -> tuple[Fault, ...]:
@@ -22,7 +19,8 @@ def _no_load(*feet: str) -> tuple[Fault, ...]:
 
 def _invalid(foot: str) -> Fault:
     """Return a fault that sends the invalid code of the vertical force of all cells of a foot."""
-    return Fault("raw", f"{foot}_STATE", 0, None, **{f"{cell}_ForceZ": _INVALID_FORCE for cell in CELLS})
+    message, signals = f"{foot}_STATE", [f"{cell}_ForceZ" for cell in CELLS]
+    return Fault("raw", message, 0, None, **{signal: invalid_code(message, signal) for signal in signals})
 
 
 #: Fault ID -> cases that are possible only in a walk on the ground.
