@@ -230,7 +230,7 @@ def stop_text(stop_requested: bool) -> str:
     Args:
         stop_requested: True if STOP or HOLD was requested, False if the dead-man switch is not pressed.
     """
-    return "the operator asked to stop" if stop_requested else "the dead-man was released or the pendant is lost"
+    return "the operator asked to stop" if stop_requested else "the dead-man switch was released or the pendant is lost"
 
 
 def implausible_torque(robot: Robot, drive_state: Vector, torque: Vector) -> str | None:

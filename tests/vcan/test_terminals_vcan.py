@@ -47,7 +47,10 @@ EVENTS = (*TERMINALS, "down", "removed")
 MISSED = {
     ROBOT: {CONTROLLER: r"HOLD: \w+: a node timed out", PENDANT: "the HAL is HOLD"},
     CONTROLLER: {ROBOT: "no SYNC received: waiting for a HAL", PENDANT: "no SYNC received"},
-    PENDANT: {ROBOT: "12 QUICK_STOP_ACTIVE", CONTROLLER: "HOLD: the dead-man was released or the pendant is lost"},
+    PENDANT: {
+        ROBOT: "12 QUICK_STOP_ACTIVE",
+        CONTROLLER: "HOLD: the dead-man switch was released or the pendant is lost",
+    },
 }
 
 

@@ -78,7 +78,7 @@ ENABLING = StartRequest(
 PRESSED = ENABLING._replace(pressed=True, cycles_left=200)
 ILL = {"diagnostic": "an encoder is stuck"}
 UNWELL = {"nodes_ready": False, "missing": {"LEFT_SK", "IMU_TORSO"}}
-STOP, RELEASED = "the operator asked to stop", "the dead-man was released or the pendant is lost"
+STOP, RELEASED = "the operator asked to stop", "the dead-man switch was released or the pendant is lost"
 OFF = ", ".join(f"{joint} is in SWITCH_ON_DISABLED" for joint in JOINTS)
 FAILED = f"the drives were not enabled within 200 cycles: {OFF}"
 STALLED = "the drives were not enabled and no drive changed its state for 10 cycles: "

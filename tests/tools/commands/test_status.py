@@ -307,7 +307,7 @@ def test_table_shows_hal_state_joints_and_bus_load(monkeypatch: pytest.MonkeyPat
     assert result.exit_code == 0, result.stderr
     assert result.stdout.startswith("pcan test: HAL ACTIVE, cycle ")
     assert "assistance factor 0.25" in result.stdout
-    assert "dead-man pressed" in result.stdout
+    assert "dead-man switch pressed" in result.stdout
     assert "4 lost" in result.stdout  # without the frames that were lost before the measurement
     assert "left_SK" in result.stdout
     assert "measured load %  computed worst case %" in result.stdout

@@ -174,7 +174,7 @@ def _headline(report: Report, target: Target) -> str:
         parts.append(f"assistance factor {report.assistance_factor:.2f}")
         parts.append(f"{report.overruns} overruns")
     if report.dead_man is not None:
-        parts.append(f"dead-man {'pressed' if report.dead_man else 'released'}")
+        parts.append(f"dead-man switch {'pressed' if report.dead_man else 'released'}")
     return ", ".join(parts) + (f"\ndiagnostic: {report.diagnostic}" if report.diagnostic else "")
 
 

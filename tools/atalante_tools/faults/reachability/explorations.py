@@ -44,7 +44,7 @@ _LATE: Final = (*range(1, LOST + 2), 16)
 _BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
 #: Largest stored number of cycles since the stop action. Larger numbers are stored as this number.
 _LONG: Final = 6
-STOP_PROPERTY: Final = "no torque command after the dead-man is released, or after STOP or HOLD is pressed"
+STOP_PROPERTY: Final = "no torque command after the dead-man switch is released, or after STOP or HOLD is pressed"
 MOVE_PROPERTY: Final = "each press of START causes at most one change to a better state"
 RESTART_PROPERTY: Final = "no change from HOLD, LOWER or FAULT to ACTIVE without a new START"
 
