@@ -185,7 +185,7 @@ class DirectionProof:
         # Reason: a delay fitted to only one or two joints might make a motor with a wrong sign look like a late motor.
         self.late = 0
         #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.
-        #: Each joint adds a share (0 to 1) to the score: the part of its motion that the torque with this delay explains.
+        #: Each joint adds a share (0 to 1) to the score of a delay: the part of its motion that the delayed torque explains.
         #: A joint adds its share only if it passed a test with a short pulse and more than two joints.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test

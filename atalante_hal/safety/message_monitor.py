@@ -85,7 +85,7 @@ class Tolerance(NamedTuple):
     A swing leg is tolerated while the other foot is on the ground. In a walk on the ground, both legs are tolerated.
     """
 
-    #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
+    #: Indices in SIDES of the legs in which a brief timeout leads to FINISH_STEP instead of HOLD.
     legs: Collection[int] = ()
     #: Extra time until a joint in one of `legs` times out [cycles]: with 3, a DBC timeout of 5 cycles becomes 8 cycles.
     #: The extra time applies only in cycles in which no frame of the joint is accepted.

@@ -58,7 +58,7 @@ CONFIRM: Final = 2
 BAND: Final = 2.0
 _BAND_SHARE: Final = 0.2
 #: The deviation of a joint is discarded while another joint of the same leg deviates, too.
-#: For the other joint, `OTHER_BAND` and `_OTHER_SHARE` replace `BAND` and `_BAND_SHARE`, so its limit is wider.
+#: The limit for that other joint is wider: it is computed with `OTHER_BAND` and `_OTHER_SHARE`.
 #: Reason: if a sensor is wrong or a load on the leg is not measured, several joints deviate although their motors are intact.
 OTHER_BAND: Final = 4.5
 _OTHER_SHARE: Final = 0.25
@@ -86,7 +86,7 @@ _LEG: Final = len(LEG_JOINTS)
 class Tolerances(NamedTuple):
     """Properties of the joints that the check uses. Each field has the shape (12,)."""
 
-    error: Vector  # Nm rms, error of the produced torque, which is computed from the motion
+    error: Vector  # Nm rms, error with which the motion gives the produced torque
     low: Vector  # rad, position below which a joint is at its lower end stop
     high: Vector  # rad, position above which a joint is at its upper end stop
 

@@ -121,8 +121,8 @@ class Drives:
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
         #: Last controlwords of all drives that had no effect on any drive, as bytes. `_apply_controlword` describes the effects.
-        #: If the HAL sends the same bytes again, the drives need not evaluate them.
-        #: The bytes are deleted when a drive state or an error changes, because the same controlwords may then have an effect.
+        #: If the HAL sends the same controlwords again, the drives need not evaluate them.
+        #: Empty after a change of a drive state or an error, because then the same controlwords may have an effect.
         self._steady = b""
         #: Joint position at which each drive holds its joint [rad]. NaN before the first encoder sample and after a state change.
         #: `_without_command` replaces NaN by the measured joint position.
@@ -219,7 +219,7 @@ class Drives:
         if jumped.any():
             self._hold_at[jumped] += speed[jumped] * PERIOD
             speed[jumped] = 0.0
-        # Set new hold positions after the shift: the measured position already contains the jump, and must not be shifted.
+        # New hold positions are set only now, without this shift, because the measured position already contains the jump.
         begins = np.isnan(self._hold_at)
         if begins.any():
             self._hold_at[begins] = self.encoders.angle[begins]

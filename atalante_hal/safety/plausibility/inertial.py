@@ -251,7 +251,7 @@ def add(imu: int, now: Readings, record: Record, time: float) -> None:
 
 
 def add_missed(imu: int, now: Readings, record: Record, turn: tuple[float, float, float], time: float) -> None:
-    """Add the turn since the last sample to the turns that the constant readings of one IMU have missed.
+    """Update the missed turns of one IMU: add the rotation since the last sample that its constant readings did not measure.
 
     Args:
         imu: index of the IMU in IMUS.

@@ -464,7 +464,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float, rate: float) -> _Comparison:
-    """Return a copy of `moved` whose error (encoder minus IMU) follows a slow drift of the IMUs.
+    """Return a copy of the comparison `moved`, with a slow drift of the IMUs added to its error (encoder minus IMU).
 
     Args:
         moved: comparison when the encoder reading of the joint last changed.

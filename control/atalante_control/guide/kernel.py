@@ -162,7 +162,7 @@ TAIL = 16
 #: Columns 20 to 23 of `step` [1/rad]: columns 0 to 3, maximum over `SLACK_CYCLES` cycles from this cycle on.
 NEAR = 20
 COLUMNS = 24
-#: Number of cycles after the prediction in which the guide must still be wider than the last predicted error.
+#: For this number of cycles after the end of the prediction, the guide must still be wider than the last predicted error.
 TAIL_CYCLES = 60
 #: Fraction of the guide width that must remain free in the last predicted cycle.
 #: The free width keeps the error inside the guide in the cycles after the last predicted cycle.

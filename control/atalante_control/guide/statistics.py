@@ -1,4 +1,4 @@
-"""Statistics of the virtual guide over a walk: `error / guide width and safety value h of each cycle -> counts, extremes`."""
+"""Statistics of the virtual guide over a walk: `error as a ratio, safety value h (each cycle) -> counts, extremes`."""
 
 from __future__ import annotations
 

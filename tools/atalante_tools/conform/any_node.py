@@ -341,7 +341,7 @@ def stays_operational(tester: NodeTester) -> Outcome:
     ]
     after_boot = list(dropwhile(lambda state: state[0] == "BOOTUP", states))
     if not after_boot:
-        raise NotTested("no heartbeat after the boot-up was received")
+        raise NotTested("no heartbeat was received after the boot-up message")
     wrong = [f"{state} in cycle {cycle}" for state, cycle in after_boot if state != "OPERATIONAL"]
     count = f"{len(after_boot)} heartbeats"
     return Outcome(

@@ -98,7 +98,7 @@ class Adversary:
         return self.tried[0]
 
     def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
-        """Search for the smallest push limits that let a joint leave the guide, and return them as a factor on `box`.
+        """Search for the smallest factor on the push limits `box` with which a push moves a joint out of the guide.
 
         Example: the factor is 1.5 if a push up to the limits `1.5 * box` moves a joint out of the guide. The factor grows until
         the search finds such a push. A bisection then makes the factor accurate to 5 %. Return None if the search finds no such
