@@ -25,7 +25,7 @@ TARGETS = {
     "ring_write": 0.02,
     "filter_tick": 1 / 20,
     "emulator_tick": 2.3,
-    "lockstep": 1 / 6,
+    "lockstep": 1 / 10,
     "lockstep_walk_pybullet": 1 / 6,
     "lockstep_walk_mujoco": 1 / 12,
     "validate_log": 1 / 20,

@@ -94,7 +94,7 @@ BENCHMARKS: Final = (
         motion.lockstep,
         "s",
         "real time: one simulated second of the whole stack, suspended",
-        1 / 6,
+        1 / 10,
     ),
     Benchmark(
         "lockstep_walk_pybullet",
