@@ -18,7 +18,6 @@ from simulated_robot import (
     ROBOT,
     SimulatedRobot,
     attitudes,
-    joints,
     only,
     row,
     signals,
@@ -35,8 +34,11 @@ from atalante_hal.safety.plausibility.legs import DRIFT_SAMPLES, SILENT_SAMPLES,
 from atalante_hal.wire.process_image import NEVER
 
 PELVIS, TIBIAE = IMUS.index("pelvis"), [IMUS.index(f"{side}_tibia") for side in ("left", "right")]
-#: Names of the joints with an IMU below them. SA and HA have none.
+#: Names of the joints with an IMU below them, and of the joints without one.
 ABOVE_IMU = [name for name in JOINTS if not name.endswith(("SA", "HA"))]
+WITHOUT_IMU = [name for name in JOINTS if name not in ABOVE_IMU]
+joints_above_imu = pytest.mark.parametrize("joint", [JOINTS.index(name) for name in ABOVE_IMU], ids=ABOVE_IMU)
+joints_without_imu = pytest.mark.parametrize("joint", [JOINTS.index(name) for name in WITHOUT_IMU], ids=WITHOUT_IMU)
 IDENTITY = [1.0, 0.0, 0.0, 0.0]
 UNIT_GEAR = replace(ROBOT, gear=np.ones(12), polarity=np.ones(12))
 
@@ -161,7 +163,7 @@ class TestDrift:
         assert hip_angles([1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half])[1] == math.pi / 2.0
         assert hip_angles([1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, -half])[1] == -math.pi / 2.0
 
-    @joints
+    @joints_above_imu
     @signs
     @pytest.mark.sample(5)
     def test_encoder_offset_beyond_threshold_is_reported_as_drift(self, joint: int, sign: float):
@@ -178,9 +180,6 @@ class TestDrift:
         # The check regards a small part of an offset of TH as a drift of the IMU headings.
         heading = 1e-4 if JOINTS[joint].endswith("TH") else 0.0
         offset = sign * (allowed * (1.0 + 1e-6) + heading)
-        if JOINTS[joint].endswith(("SA", "HA")):  # no IMU is below this joint, so its faults are not detected
-            assert robot.run(400, off) == ()
-            return
         assert 64 < robot.until_found(Dtc.ENC_DRIFT, 128, off) <= 128
         finding = only(robot.checks.findings)
         named = JOINTS[joint].replace("SK", "SH")
@@ -196,6 +195,16 @@ class TestDrift:
         for offset in np.linspace(sign * allowed, 0.0, 20):  # noqa: B007 - read by `off`
             robot.cycle(off)
         assert robot.run(33, off) == ()
+
+    @joints_without_imu
+    @signs
+    @pytest.mark.sample(5)
+    def test_encoder_offset_of_a_joint_without_imu_is_not_reported(self, joint: int, sign: float):
+        """The offset reaches twice the threshold slowly, because a jump of the encoder is reported."""
+        robot = SimulatedRobot(amplitude=0.0)
+        for offset in np.linspace(0.0, 2.0 * sign * ROBOT.sensors.attitude_error, 40) * GEAR[joint]:
+            robot.cycle(lambda now, by=offset: now.position.__setitem__(joint, now.position[joint] + by))
+        assert robot.run(400, lambda now: now.position.__setitem__(joint, now.position[joint] + offset)) == ()
 
     @pytest.mark.parametrize("leg", [0, 1])
     def test_encoder_angles_agree_modulo_a_full_turn(self, leg: int):
@@ -822,10 +831,9 @@ class TestStandingEncoder:
     def still(now: Signals) -> None:
         now.position[:] = MIDDLE * GEAR
 
-    @joints
-    @pytest.mark.parametrize("phase", [0, 9, 24])
-    @pytest.mark.sample(7)
-    def test_stuck_encoder_is_found_without_torque(self, joint: int, phase: int):
+    @staticmethod
+    def swinging(joint: int, phase: int) -> tuple[SimulatedRobot, Callable[[Signals], None]]:
+        """Return a robot whose joints swing without torque, and the change that keeps the reading of an encoder constant."""
         robot = SimulatedRobot(amplitude=0.1)
         robot.run(200 + phase, lambda now: now.torque.fill(0.0))
         stuck = float(robot.now.position[joint])
@@ -834,9 +842,20 @@ class TestStandingEncoder:
             now.position[joint] = stuck
             now.torque[:] = 0.0
 
-        if JOINTS[joint].endswith(("SA", "HA")):  # no IMU is below this joint, so its faults are not detected
-            assert robot.run(400, stick) == ()
-            return
+        return robot, stick
+
+    @joints_without_imu
+    @pytest.mark.parametrize("phase", [0, 9, 24])
+    @pytest.mark.sample(7)
+    def test_stuck_encoder_of_a_joint_without_imu_is_not_found_without_torque(self, joint: int, phase: int):
+        robot, stick = self.swinging(joint, phase)
+        assert robot.run(400, stick) == ()
+
+    @joints_above_imu
+    @pytest.mark.parametrize("phase", [0, 9, 24])
+    @pytest.mark.sample(7)
+    def test_stuck_encoder_is_found_without_torque(self, joint: int, phase: int):
+        robot, stick = self.swinging(joint, phase)
         robot.until_found(Dtc.ENC_STUCK, 80, stick)
         finding = only(robot.checks.findings)
         assert finding.node == JOINTS[joint].upper()
@@ -847,20 +866,17 @@ class TestStandingEncoder:
         robot.missing = {row(f"IMU_{JOINTS[joint].split('_')[0]}_tibia")}
         assert robot.run(9, stick)[0] is finding
 
-    @joints
+    @joints_above_imu
     @signs
     def test_leg_turn_beyond_threshold_reports_stuck_encoder(self, joint: int, sign: float):
-        if JOINTS[joint].endswith(("SA", "HA")):
-            return
         robot, turn = self.standing(joint)
         turn(sign * 0.99 * self.allowed)
         assert robot.run(33, self.still) == ()
         robot, turn = self.standing(joint)
         turn(sign * 1.01 * self.allowed)
         assert 16 < robot.until_found(Dtc.ENC_STUCK, 48, self.still) <= 48
-        pair = (
-            {joint, joint ^ 1} if JOINTS[joint].endswith(("SH", "SK")) else {joint}
-        )  # the IMUs cannot separate SH from SK
+        # The IMUs cannot separate SH from SK.
+        pair = {joint, joint ^ 1} if JOINTS[joint].endswith(("SH", "SK")) else {joint}
         assert [f.node for f in robot.checks.findings] == [JOINTS[one].upper() for one in sorted(pair)]
         # The check regards a small part of the turn as a drift of the IMU headings.
         heading = 1e-5 if JOINTS[joint].endswith("TH") else 0.0
@@ -1023,7 +1039,7 @@ class TestStandingEncoder:
             assert one_leg.legs.findings() == ()
 
     @pytest.mark.sample(7)
-    @pytest.mark.parametrize("joint", [JOINTS.index(name) for name in ABOVE_IMU], ids=ABOVE_IMU)
+    @joints_above_imu
     @signs
     def test_slow_turn_of_a_joint_with_stuck_encoder_is_found(self, joint: int, sign: float):
         """The joint turns slowly, without torque. An even slower turn is found as a drift."""
