@@ -20,6 +20,7 @@ from atalante_hal.wire.frame import (
     FRAME,
     ID_ERROR,
     ID_EXTENDED,
+    ID_MASK,
     ID_REMOTE,
     Frames,
     as_words,
@@ -114,7 +115,7 @@ def is_legal(can_id: int, length: int, flags: int) -> bool:
     Returns:
         True if identifier, length and flags are a valid combination.
     """
-    number = can_id & 0x1FFF_FFFF
+    number = can_id & ID_MASK
     if not can_id & ID_EXTENDED and not can_id & ID_ERROR and number > 0x7FF:
         return False
     if flags & FLAG_FDF:

@@ -7,7 +7,6 @@ faster.
 from __future__ import annotations
 
 import errno
-import struct
 import time
 from typing import Any
 
@@ -22,15 +21,14 @@ from atalante_hal.wire.frame import (
     FLAG_ESI,
     FLAG_FDF,
     FRAME_BYTES,
+    FRAME_STRUCT,
     ID_ERROR,
     ID_EXTENDED,
+    ID_MASK,
     ID_REMOTE,
     Frames,
 )
 
-#: Memory layout of one `FRAME`: identifier, length, flags, payload.
-RECORD = struct.Struct("<IBB2x64s")
-ID_NUMBER = 0x1FFF_FFFF
 #: Remedy of a lost link.
 RESTART = "restart this program when the link works again, because python-can does not open it again"
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
@@ -83,7 +81,7 @@ class PythonCanBus:
         """
         self._require_open()
         memory, _ = self._batches.to_send(frames)
-        for sent, (can_id, length, flags, data) in enumerate(RECORD.iter_unpack(memory)):
+        for sent, (can_id, length, flags, data) in enumerate(FRAME_STRUCT.iter_unpack(memory)):
             try:
                 self._bus.send(message_of(can_id, length, flags, data), timeout=0.0)
             except can.CanOperationError as error:
@@ -172,7 +170,7 @@ def message_of(can_id: int, length: int, flags: int, data: bytes) -> can.Message
     """
     remote = bool(can_id & ID_REMOTE)
     return can.Message(
-        arbitration_id=can_id & ID_NUMBER,
+        arbitration_id=can_id & ID_MASK,
         is_extended_id=bool(can_id & ID_EXTENDED),
         is_remote_frame=remote,
         is_error_frame=bool(can_id & ID_ERROR),
@@ -212,7 +210,7 @@ def pack(message: can.Message, memory: memoryview, offset: int) -> bool:
             flags |= FLAG_ESI
     if not is_legal(can_id, message.dlc, flags) or (message.dlc != len(message.data) and not remote):
         return False
-    RECORD.pack_into(memory, offset, can_id, message.dlc, flags, bytes(message.data))
+    FRAME_STRUCT.pack_into(memory, offset, can_id, message.dlc, flags, bytes(message.data))
     return True
 
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from atalante_hal.closing import Closing
 from atalante_hal.telemetry.sink import SinkError
-from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_MASK, ID_REMOTE, Frames
 
 #: File formats of python-can that store CAN FD frames completely.
 FORMATS = (".log", ".asc", ".blf", ".log.gz", ".asc.gz")
@@ -115,7 +115,7 @@ class CanLog(Closing):
                 self._logger.on_message_received(
                     can.Message(
                         timestamp=stamp * 1e-9,
-                        arbitration_id=can_id & 0x1FFFFFFF,
+                        arbitration_id=can_id & ID_MASK,
                         is_extended_id=bool(can_id & ID_EXTENDED),
                         is_remote_frame=bool(can_id & ID_REMOTE),
                         is_error_frame=bool(can_id & ID_ERROR),

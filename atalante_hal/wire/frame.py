@@ -6,6 +6,7 @@ directly from the receive buffer of the socket. The record size of 72 bytes keep
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,8 @@ import numpy.typing as npt
 #: Record type of a frame, `struct canfd_frame` of linux/can.h.
 FRAME = np.dtype([("can_id", "<u4"), ("len", "u1"), ("flags", "u1"), ("res", "u1", 2), ("data", "u1", 64)])
 FRAME_BYTES = FRAME.itemsize
+#: Layout of `FRAME` for one frame at a time: identifier, length, flags, payload.
+FRAME_STRUCT = struct.Struct("<IBB2x64s")
 #: Length of the header before the payload [bytes].
 HEADER_BYTES = FRAME_BYTES - FRAME["data"].itemsize
 #: Record length in 64-bit words: one header word and eight payload words.
@@ -24,6 +27,8 @@ _WORD = np.dtype("<u8")
 FLAG_BRS = 0x01  # bit rate switch: the payload has the data bit rate
 FLAG_ESI = 0x02  # error state indicator: the sender is error passive
 FLAG_FDF = 0x04  # CAN FD frame
+#: Mask of the bits of an identifier. The bits above them are the flags `ID_EXTENDED`, `ID_REMOTE` and `ID_ERROR`.
+ID_MASK = 0x1FFF_FFFF
 ID_EXTENDED = 1 << 31
 ID_REMOTE = 1 << 30
 ID_ERROR = 1 << 29

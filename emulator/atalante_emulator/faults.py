@@ -16,7 +16,7 @@ from atalante_dbc import Message, Network
 from atalante_emulator.motor import MOST_LATE
 from atalante_hal.robot import CELLS
 from atalante_hal.wire.cia402 import DriveState
-from atalante_hal.wire.frame import FD_LENGTHS
+from atalante_hal.wire.frame import FD_LENGTHS, ID_MASK
 
 Value = float | int | str
 
@@ -117,7 +117,7 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
         "frames with an identifier outside the network arrive, `count` per cycle, before all others",
         "bus",
         {
-            "can_id": _whole(0, 0x1FFF_FFFF),
+            "can_id": _whole(0, ID_MASK),
             "bytes": _fd_length(default=8),
             "count": _whole(1, 64, default=1),
         },

@@ -9,13 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc.foreign import Catalogue, Layout, Refused
-from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, header_word
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, ID_MASK, header_word
 from atalante_tools.canlog.column_codec import ColumnCodec, crc_of_zeros
 
 #: Message index for an identifier that is not in the DBC.
 UNKNOWN = -1
 _STANDARD = 1 << 11
-_ALL_BITS = 0x1FFF_FFFF
 
 Rows = npt.NDArray[np.int16]
 
@@ -97,13 +96,13 @@ class Plan:
         extended: dict[int, int] = {}
         groups: dict[int, dict[int, int]] = {}
         items = [(m.frame_id, m.extended, m.pgn_mask) for m in self.layouts]
-        items += [(m.frame_id, m.extended, _ALL_BITS) for m in self.refused]
+        items += [(m.frame_id, m.extended, ID_MASK) for m in self.refused]
         for row, (frame_id, is_extended, mask) in enumerate(items):
             if not is_extended:
                 standard[frame_id] = row
                 continue
             extended[frame_id] = row
-            if mask != _ALL_BITS:
+            if mask != ID_MASK:
                 # Two messages of one J1939 parameter group have the same masked identifier.
                 # A masked identifier that several messages share is ambiguous, so it is treated as unknown.
                 known = groups.setdefault(mask, {})
@@ -124,7 +123,7 @@ class Plan:
         rows = self._standard[np.where(is_standard, can_ids, 0)]
         rows[~is_standard] = UNKNOWN
         indices = np.flatnonzero((can_ids & np.uint32(0xE0000000)) == ID_EXTENDED)
-        rows[indices] = self._rows_extended(can_ids[indices] & np.uint32(_ALL_BITS))
+        rows[indices] = self._rows_extended(can_ids[indices] & np.uint32(ID_MASK))
         return rows
 
     def _rows_extended(self, numbers: npt.NDArray[np.uint32]) -> Rows:
@@ -145,7 +144,7 @@ class Plan:
         Args:
             can_ids: identifiers with SocketCAN flags, shape (n,).
         """
-        numbers = can_ids & np.uint32(_ALL_BITS)
+        numbers = can_ids & np.uint32(ID_MASK)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]
         short[numbers >= _STANDARD] = UNKNOWN
         is_extended = (can_ids & np.uint32(ID_EXTENDED)) != 0

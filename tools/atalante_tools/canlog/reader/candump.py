@@ -24,6 +24,7 @@ from atalante_hal.wire.frame import (
     FRAME_BYTES,
     ID_ERROR,
     ID_EXTENDED,
+    ID_MASK,
     ID_REMOTE,
     new_frames,
 )
@@ -37,7 +38,7 @@ MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
 _NAME_BYTES = 16  # maximum length of a channel name in a regular line; Linux allows 15
 _MAX_DIGITS = 2 * 64  # maximum number of hexadecimal digits in a payload
-_STANDARD, _ALL_BITS = 0x7FF, 0x1FFF_FFFF
+_STANDARD = 0x7FF
 _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
 _HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
@@ -300,7 +301,7 @@ def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.
         upper = codes[:, 0] << 28 | codes[:, 1] << 24 | codes[:, 2] << 20 | codes[:, 3] << 16 | codes[:, 4] << 12
         whole = upper | number
         errors = (whole & np.uint32(ID_ERROR)) != 0
-        regular &= ~lines.extended | ((codes < 16).all(axis=1) & (whole <= _ALL_BITS | ID_ERROR))
+        regular &= ~lines.extended | ((codes < 16).all(axis=1) & (whole <= ID_MASK | ID_ERROR))
         wide = np.where(errors, whole, whole | np.uint32(ID_EXTENDED))
         number = np.where(lines.extended, wide, number)
     regular &= lines.extended | (number <= _STANDARD)
@@ -362,7 +363,7 @@ def _read_line(line: bytes, chunk: Chunk, row: int, channels: Channels) -> bool:
     if len(data) > 64 or (len(match[4]) == 3 and number > _STANDARD):
         return False
     if len(match[4]) == 8:
-        if number > _ALL_BITS | ID_ERROR:
+        if number > ID_MASK | ID_ERROR:
             return False
         number |= 0 if number & ID_ERROR else ID_EXTENDED
     frame = np.zeros(1, chunk.frames.dtype)

@@ -27,6 +27,7 @@ from atalante_hal.wire.frame import (
     FLAG_ESI,
     FLAG_FDF,
     FRAME_BYTES,
+    FRAME_STRUCT,
     ID_ERROR,
     ID_EXTENDED,
     ID_REMOTE,
@@ -40,7 +41,6 @@ _LINE_FORMATS = (".asc", ".trc", ".csv")
 _BLF_HEADER = struct.Struct("<4sLBBBBBBBBQQ")
 #: First bytes of an MDF file.
 _MDF = b"MDF     "
-_RECORD = struct.Struct("<IBB2x64s")
 
 
 def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
@@ -180,7 +180,7 @@ class _Batch:
             can_id, length = can_id | ID_REMOTE, message.dlc
         if message.is_fd:
             flags = FLAG_FDF | bool(message.bitrate_switch) * FLAG_BRS | bool(message.error_state_indicator) * FLAG_ESI
-        _RECORD.pack_into(self._memory, self.count * FRAME_BYTES, can_id, min(length, 255), flags, data[:64])
+        FRAME_STRUCT.pack_into(self._memory, self.count * FRAME_BYTES, can_id, min(length, 255), flags, data[:64])
         self._stamps.append(round(message.timestamp * 1e9))
         self._channels.append(channels.index("" if message.channel is None else str(message.channel)))
         self._sent.append((RECEIVED if message.is_rx else SENT) if keeps_direction else NO_DIRECTION)

@@ -11,7 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.wire.frame import FD_LENGTHS, FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, as_words
+from atalante_hal.wire.frame import (
+    FD_LENGTHS,
+    FLAG_BRS,
+    FLAG_ESI,
+    FLAG_FDF,
+    ID_ERROR,
+    ID_EXTENDED,
+    ID_MASK,
+    ID_REMOTE,
+    as_words,
+)
 from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, SENT, Chunk
 from atalante_tools.canlog.validate.buses import ChannelMap
@@ -24,7 +34,6 @@ _CLASSIC_LENGTH = np.arange(256) <= 8
 #: `_CONTROLLER` is a bit in the identifier of an error frame. It means "controller problem" (linux/can/error.h).
 #: `_OVERFLOW` is two bits in payload byte 1 of an error frame. They mean "receive overflow" and "transmit overflow".
 _CONTROLLER, _OVERFLOW = 0x4, 0x3
-_NUMBER = 0x1FFF_FFFF
 #: The recorder is the node that wrote the log. The log marks the frames of the recorder as sent.
 #: A node counts as the recorder if it sends at least this share (0 to 1) of the frames that the log marks as sent.
 _RECORDER = 0.99
@@ -204,7 +213,7 @@ class FrameRules:
         named = numbers[np.argsort(-counts, kind="stable")[:MAX_UNKNOWN_IDS]]
         for number in named.tolist():
             # A 29-bit identifier has eight digits: 0x7f0 and 0x000007f0 are different identifiers.
-            name = f"{number & _NUMBER:#010x}" if number & ID_EXTENDED else f"{number:#x}"
+            name = f"{number & ID_MASK:#010x}" if number & ID_EXTENDED else f"{number:#x}"
             self._add_unknown(name, stamps[strange == number])
         if len(named) < len(numbers):
             self._add_unknown(OTHERS, stamps[~np.isin(strange, named)])

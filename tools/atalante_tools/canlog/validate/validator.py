@@ -10,6 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.wire.frame import ID_MASK
 from atalante_tools.canlog.plan import Plan, Rows
 from atalante_tools.canlog.reader.chunk import Chunk
 from atalante_tools.canlog.reader.log_file import Remark
@@ -25,8 +26,6 @@ from atalante_tools.canlog.validate.order_rules import OrderRules
 from atalante_tools.canlog.validate.project import Project
 from atalante_tools.canlog.validate.timing_rules import TimingRules
 from atalante_tools.canlog.validate.value_rules import Decoded, ValueRules
-
-_ALL_BITS = 0x1FFF_FFFF
 
 
 class Validator:
@@ -68,7 +67,7 @@ class Validator:
         self._family_of = {row: family for family in self.plan.families for row in family.rows}
         #: Number of rejected frames since the last valid frame, for each message.
         self._pending = np.zeros(len(self.plan.layouts), np.int64)
-        self._groups = [row for row, m in enumerate(self.plan.layouts) if m.pgn_mask != _ALL_BITS]
+        self._groups = [row for row, m in enumerate(self.plan.layouts) if m.pgn_mask != ID_MASK]
         self._address: dict[int, int] = {}
         #: Indices of the J1939 messages that the timing rules do not check, because several sender addresses send them.
         self.shared: set[int] = set()
