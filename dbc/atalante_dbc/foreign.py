@@ -22,14 +22,12 @@ from cantools.database.can import Message as RawMessage
 from cantools.database.can import Signal as RawSignal
 from cantools.database.errors import Error as CantoolsError
 
-from atalante_dbc.network import DbcError, decoded_text
+from atalante_dbc.network import E2E_HEADER, DbcError, decoded_text
 
 #: Longest payload of a CAN FD frame and of a classic CAN frame [byte].
 _FRAME_BYTES, _CLASSIC_BYTES = 64, 8
 _WORD = 64
 _FLOAT_BITS = (16, 32, 64)
-#: Signals of the E2E Profile 5 header: start bit and number of bits, as in `parser`.
-_E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 _LARGEST_DATA_ID = 0xFFFF
 #: Values of GenMsgSendType for cyclic messages, in lower case. The empty text stands for a missing GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
@@ -314,7 +312,7 @@ def _data_id(message: RawMessage) -> int | None:
     """Return the E2E Data ID of a message; None if the message has no Profile 5 header or no Data ID of 16 bits."""
     data_id = _number(_of(message, "E2EDataId"))
     header = {s.name: (s.start, s.length) for s in message.signals if s.byte_order == "little_endian"}
-    has_header = all(header.get(name) == bits for name, bits in _E2E_HEADER.items())
+    has_header = all(header.get(name) == bits for name, bits in E2E_HEADER.items())
     return int(data_id) if data_id and data_id <= _LARGEST_DATA_ID and has_header else None
 
 

@@ -9,6 +9,8 @@ from typing import TypeVar
 
 #: Largest signal length [bit]. The codec rounds integers of at most this length exactly.
 LONGEST_SIGNAL = 51
+#: Signals of the E2E Profile 5 header at the start of a payload: start bit and number of bits.
+E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 
 
 class DbcError(ValueError):

@@ -20,12 +20,10 @@ from cantools.database.can import Signal as RawSignal
 from cantools.database.errors import Error as CantoolsError
 
 from atalante_dbc.attributes import missing, wrong_values
-from atalante_dbc.network import LONGEST_SIGNAL, DbcError, Message, Network, Node, Signal, decoded_text
+from atalante_dbc.network import E2E_HEADER, LONGEST_SIGNAL, DbcError, Message, Network, Node, Signal, decoded_text
 
 #: Valid payload lengths of CAN FD [byte] (ISO 11898-1).
 _LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-#: Signals of the E2E Profile 5 header at the start of every frame: start bit and number of bits.
-_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 _FD_FORMAT = "StandardCAN_FD"
 _BO = re.compile(r"BO_\s+(\d+)\s+(\w+)\s*:\s*(\d+)\s+(\w+)")
 _SG = re.compile(r"SG_\s+(\w+)\s*(\w*)\s*:")
@@ -142,7 +140,7 @@ def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
         yield f"must be a CAN FD frame; set VFrameFormat to {_FD_FORMAT}"
     if not set(message.senders) <= nodes or len(message.senders) != 1:
         yield f"must have one sender from BU_, got {', '.join(message.senders) or 'none'}"
-    for name, (start, length) in _HEADER.items():
+    for name, (start, length) in E2E_HEADER.items():
         found = next((s for s in message.signals if s.name == name), None)
         if found is None or (found.start, found.length, found.is_signed) != (start, length, False):
             yield f"must have the unsigned signal {name} : {start}|{length}@1+ of the E2E header"
