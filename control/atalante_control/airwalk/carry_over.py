@@ -15,10 +15,9 @@ from typing import Annotated
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.structured import Records, zeros
 from atalante_hal.robot import JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 
 class Carry:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.config import StepGuideConfig
 from atalante_control.joint.pid import AIR_GAINS, PidGains
+from atalante_hal.types import PERIOD
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from atalante_control.airwalk.swing_leg import OVERLAP, swing_leg
 from atalante_control.airwalk.telemetry import TELEMETRY_FIELDS, AirwalkStatistics, Step, Telemetry
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.dynamics.suspended import check_suspended, suspended_gait
-from atalante_control.gait.gait import PERIOD, Gait, step_over
+from atalante_control.gait.gait import Gait, step_over
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.certificate import Certificate
 from atalante_control.guide.filter import GuideFilter
@@ -53,7 +53,7 @@ from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_control.structured import Records, zeros
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, Robot
-from atalante_hal.types import Command, State, Vector
+from atalante_hal.types import PERIOD, Command, State, Vector
 
 __all__ = ["AirwalkConfig", "AirwalkController"]
 

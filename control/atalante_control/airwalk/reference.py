@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD, Gait
+from atalante_control.gait.gait import Gait
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.joint.pid import LEFT, RIGHT
 from atalante_hal.robot import JOINTS, LEG_JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 _N, _LEG, _SA = len(JOINTS), len(LEG_JOINTS), LEG_JOINTS.index("SA")
 

@@ -6,11 +6,12 @@ import numpy as np
 
 from atalante_control.airwalk.config import AirwalkConfig
 from atalante_control.dynamics.gravity import Gravity
-from atalante_control.gait.gait import PERIOD, Gait, motion
+from atalante_control.gait.gait import Gait, motion
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.disturbance import Leg
 from atalante_control.joint.idealization import AssistedInertia
 from atalante_hal.robot import LEG_JOINTS
+from atalante_hal.types import PERIOD
 
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 #: Number of cycles beyond the end of the step for which the guides predict the motion of the leg.

@@ -20,11 +20,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from atalante_hal.robot import JOINTS, LEG_JOINTS, MIRROR_SIGN, SIDES, Robot
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 FORMAT = "atalante-gait/1"
 DEGREE = 7
-PERIOD = 1e-3  # s, period of the control cycle; a step lasts a whole number of cycles
 AIRWALK_GAIT = Path(__file__).parents[1] / "gaits" / "airwalk.json"
 
 #: Index and sign for mirroring: the angle of joint i of the mirrored robot is SIGN[i] times the angle of joint SWAP[i].

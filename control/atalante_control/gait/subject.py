@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.model import Patient
+from atalante_hal.types import PERIOD
 
 STEP_LENGTH_RANGE = (0.05, 0.40)  # m, accepted step lengths; some of them have no feasible gait
 STEP_DURATION_RANGE = (0.4, 2.0)  # s, accepted step durations; some of them have no feasible gait

@@ -26,8 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.kernel import (
     COLUMNS,
     FLOOR,
@@ -38,7 +37,7 @@ from atalante_control.guide.shapes import GuideShape
 from atalante_control.joint.idealization import law_of
 from atalante_control.structured import Records, zeros
 from atalante_hal.compiled import compiled, specialised
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
 

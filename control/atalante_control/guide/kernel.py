@@ -13,11 +13,10 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.backup_policy import STATES
 from atalante_control.joint.idealization import Law, idealization, mass
 from atalante_control.structured import Records
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
 

@@ -23,7 +23,6 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.certificate import Certificate
 from atalante_control.guide.disturbance import Leg
 from atalante_control.guide.kernel import Guard, LegState
@@ -31,7 +30,7 @@ from atalante_control.guide.shapes import GuideShape
 from atalante_control.joint.pid import LegGains
 from atalante_control.structured import Records, zeros
 from atalante_hal.robot import LEG_JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.backup_policy import BackupPolicy
 from atalante_control.guide.certificate import SMALLEST, Certificate, PromiseLimits
 from atalante_control.guide.config import StepGuideConfig
@@ -21,7 +20,7 @@ from atalante_control.guide.prediction import Assumptions, prediction_of
 from atalante_control.guide.shapes import GuideShape, half_width
 from atalante_control.joint.idealization import AssistedInertia
 from atalante_hal.robot import LEG_JOINTS, Robot
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 #: Knee angle [rad] at which the gains of the backup policy (spring and damper) are computed, in the middle of the swing.
 #: At any knee angle other than `_MIDDLE`, mass matrix and stiffness of the joints are different, see `BackupPolicy.mass`.

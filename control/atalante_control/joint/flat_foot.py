@@ -22,12 +22,11 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters, imu_link
 from atalante_control.structured import Records, zeros
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
-from atalante_hal.types import State, Vector
+from atalante_hal.types import PERIOD, State, Vector
 
 Pair = tuple[float, float]
 Quaternion = tuple[float, float, float, float]

@@ -14,11 +14,10 @@ from typing import Annotated
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.structured import Records, zeros
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 PerJoint = tuple[float, float, float, float, float, float]  # one value for each joint of a leg: FH, TH, SH, SK, SA, HA
 

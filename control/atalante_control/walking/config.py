@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.config import StepGuideConfig
 from atalante_control.guide.disturbance import HandOver
 from atalante_control.joint.pid import PidGains
@@ -15,7 +14,7 @@ from atalante_control.walking.contact import ImpactConfig
 from atalante_control.walking.lean import LeanConfig
 from atalante_control.walking.placement import PlacementConfig
 from atalante_hal.robot import JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
 

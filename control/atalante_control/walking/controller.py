@@ -19,7 +19,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from atalante_control.dynamics.gravity import Gravity
-from atalante_control.gait.gait import PERIOD
 from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.certificate import Certificate
 from atalante_control.guide.outside_count import OutsideCount
@@ -57,7 +56,7 @@ from atalante_control.walking.steering import Steering
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS, Telemetry, WalkStatistics
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, Robot
-from atalante_hal.types import Command, State, SupervisorState, Vector
+from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 
 Pair = tuple[float, float]
 

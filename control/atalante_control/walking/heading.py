@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD
+from atalante_hal.types import PERIOD
 
 
 class HeadingConfig(NamedTuple):

@@ -14,7 +14,6 @@ import math
 from typing import Annotated, NamedTuple
 
 from atalante_control.dynamics.gravity import LinkRecord, hold
-from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.kernel import GuideTables, leg_state, tick
 from atalante_control.guide.literal import LiteralTables, assistive_torque
 from atalante_control.joint.flat_foot import Ankle, start_level_ankle, write_level_ankle
@@ -39,7 +38,7 @@ from atalante_control.walking.reference import PhaseTable
 from atalante_control.walking.rotation import tilt_quaternion
 from atalante_control.walking.telemetry import Telemetry, write_guide, write_telemetry
 from atalante_hal.robot import CELLS, JOINTS, LEG_JOINTS, MOTORS, SIDES
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 from atalante_hal.vectors import Vector3, cross, rotated
 
 _LEG = len(LEG_JOINTS)

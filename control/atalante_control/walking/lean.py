@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from atalante_control.gait.gait import PERIOD
+from atalante_hal.types import PERIOD
 
 
 class LeanConfig(NamedTuple):

@@ -29,11 +29,10 @@ from __future__ import annotations
 import math
 from typing import Annotated, NamedTuple
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.structured import Records
 from atalante_control.walking.kinematics import Link, turn_link
 from atalante_hal.robot import LEG_JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 from atalante_hal.vectors import Vector3, cross, dot, rotated
 
 Pair = tuple[float, float]

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from atalante_control.dynamics.gravity import Gravity
-from atalante_control.gait.gait import PERIOD
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.certificate import Certificate
@@ -32,7 +31,7 @@ from atalante_control.walking.reference import PhaseTable, Reach, shift_tables, 
 from atalante_control.walking.standing import Standing
 from atalante_control.walking.swing_leg import swing_leg
 from atalante_hal.robot import JOINTS, LEG_JOINTS, Robot
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
 

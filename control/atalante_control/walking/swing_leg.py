@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from atalante_control.dynamics.gravity import Gravity
-from atalante_control.gait.gait import PERIOD, Gait, motion
+from atalante_control.gait.gait import Gait, motion
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.disturbance import Leg
 from atalante_control.joint.idealization import AssistedInertia, Friction
@@ -30,7 +30,7 @@ from atalante_control.model import ArticulatedModel
 from atalante_control.walking.kinematics import Kinematics
 from atalante_control.walking.rotation import tilt_quaternion
 from atalante_hal.robot import LEG_JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.walking.heading import HeadingConfig, HeadingFilter
+from atalante_hal.types import PERIOD
 
 CONFIG = HeadingConfig()
 SECONDS = 300

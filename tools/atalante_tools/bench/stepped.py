@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.filter import GuideFilter
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 
 class SteppedRollout:

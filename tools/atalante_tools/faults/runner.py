@@ -16,14 +16,14 @@ import numpy.typing as npt
 
 import atalante_dbc
 from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
-from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, Gait, load_gait
+from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
 from atalante_control.guide.shapes import SHAPES
 from atalante_control.joint.leg_model import leg_model
 from atalante_dbc import Network
 from atalante_hal.leg_model import LegModel
 from atalante_hal.loop import run
 from atalante_hal.robot import Robot, load_robot
-from atalante_hal.types import State, SupervisorState, Vector
+from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_tools.console.options import EMBEDDED, PYBULLET, Target
 from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, TimedStimuli

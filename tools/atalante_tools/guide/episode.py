@@ -19,14 +19,14 @@ import numpy as np
 
 from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
 from atalante_control.airwalk.kernel import Measured, Parts, run
-from atalante_control.gait.gait import PERIOD, Gait, motion
+from atalante_control.gait.gait import Gait, motion
 from atalante_control.guide.kernel import GuideTables
 from atalante_control.guide.shapes import GuideShape
 from atalante_control.joint.pid import RIGHT
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
-from atalante_hal.types import State, SupervisorState, Vector
+from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_tools.guide.plant import HIP, KNEE, Condition, Plant, advance, inverse_dynamics, limited, plant
 
 Pair = tuple[float, float]

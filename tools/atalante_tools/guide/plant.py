@@ -24,11 +24,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio
 
-from atalante_control.gait.gait import PERIOD, Gait
+from atalante_control.gait.gait import Gait
 from atalante_control.model import ArticulatedModel
 from atalante_emulator.drive import DriveParameters
 from atalante_hal.robot import JOINTS, Robot
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 
 #: Indices in JOINTS of the sagittal hip and the sagittal knee of the left leg.
 HIP, KNEE = JOINTS.index("left_SH"), JOINTS.index("left_SK")

@@ -19,13 +19,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from atalante_control.airwalk.controller import AirwalkController
-from atalante_control.gait.gait import PERIOD
 from atalante_control.model import ExoskeletonParameters
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.faults import Fault
 from atalante_emulator.mechanics import Mechanics
 from atalante_hal.robot import JOINTS, LEG_JOINTS
-from atalante_hal.types import State, SupervisorState, Vector
+from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.guide.episode import RATE, Push, Setup
 from atalante_tools.guide.plant import HIP, KNEE, Condition
