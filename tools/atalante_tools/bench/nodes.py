@@ -97,7 +97,7 @@ class Recording:
         self.cyclic = cyclic_messages(network)
         image = TransmitImage(self.cyclic)
         codec, rng = image.codec, np.random.default_rng(0)
-        self.values = np.tile(_walking(walk, image), (POSES, 1))
+        self.values = np.tile(_walking(image), (POSES, 1))
         motor = walk.robot.gear * walk.robot.polarity
         phase = 2.0 * np.pi * np.arange(POSES)[:, None] / POSES
         swing = ERROR_RATE * POSES * PERIOD / (2.0 * np.pi) * np.sin(phase)
@@ -190,7 +190,7 @@ def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.u
     return octets[:, HEADER_BYTES + COUNTER_BYTE], halves[:, HEADER_BYTES // 2]
 
 
-def _walking(walk: Walk, image: TransmitImage) -> Vector:
+def _walking(image: TransmitImage) -> Vector:
     """Return a plausible value of each signal, shape (signals,). `Recording` adds motion and noise to these values.
 
     The HAL reports no fault if it receives the resulting values.

@@ -105,7 +105,7 @@ def evaluate(row: Row, case: Case, run: Observation) -> Verdict:
         *_state(run, case, expected, reaction),
         *_diagnostic(run, case, expected),
         *limit_violations(run),
-        *_recovery(run, case, expected),
+        *_recovery(run, case),
         *(sentence for check in case.checks if (sentence := check(run)) is not None),
     ]
     reported = _reported(run, expected)
@@ -238,7 +238,7 @@ def _reported(run: Observation, expected: Expectation) -> list[Event]:
     return [event for event in run.events if event.cycle >= run.first and re.fullmatch(expected.dtc, event.code)]
 
 
-def _recovery(run: Observation, case: Case, expected: Expectation) -> list[str]:
+def _recovery(run: Observation, case: Case) -> list[str]:
     # A case that begins at power-on skips this check, because the HAL itself changes to less severe states after power-on.
     found = [] if case.phase is None else automatic_improvements(run, run.last_before_start)
     if run.pressed is None:
