@@ -14,7 +14,7 @@ from atalante_control.gait.walk import DEFAULT_WALK, load_walk
 from atalante_control.model import ExoskeletonParameters, Patient, urdf
 from atalante_dbc import Network
 from atalante_hal.bus import BusDown
-from atalante_hal.bus.pair import PairBus, lockstep_pair
+from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
@@ -35,7 +35,6 @@ class OtherProcess:
         self.hal = Hal(network, robot, self.hal_bus)
         self.stop = StopRequest()
         self.tap: list[Frames] = []
-        self.pendant_bus: PairBus | None = None
         self._cycles = cycles
         self.bus.step = self.cycle
         self.active_at: int | None = None

@@ -36,9 +36,9 @@ MIDDLE = (ROBOT.position_min + ROBOT.position_max) / 2.0
 #: Largest change of each joint position in one cycle that is not regarded as a jump [rad].
 REACH = ROBOT.top_speed * PERIOD + 3.0 * ROBOT.encoder_noise
 
-_MODEL = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
-_DATA = _MODEL.model.createData()
-_IMU_FRAMES = [_MODEL.model.getFrameId(f"imu_{imu}") for imu in IMUS]
+MODEL = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
+DATA = MODEL.model.createData()
+_IMU_FRAMES = [MODEL.model.getFrameId(f"imu_{imu}") for imu in IMUS]
 _NOISE = [signals_of(CODEC, row) for row in np.random.default_rng(1).standard_normal((1021, CODEC.size))]
 _NO_FRAMES = new_frames(len(MESSAGES))
 
@@ -58,10 +58,10 @@ def row(name: str) -> int:
 
 def attitudes(position: np.ndarray) -> np.ndarray:
     """Return the quaternions wxyz of the four IMUs at these joint positions [rad], computed with Pinocchio."""
-    q = pinocchio.neutral(_MODEL.model)
-    q[_MODEL.q] = position
-    pinocchio.framesForwardKinematics(_MODEL.model, _DATA, q)
-    quaternions = [pinocchio.Quaternion(_DATA.oMf[frame].rotation).coeffs() for frame in _IMU_FRAMES]
+    q = pinocchio.neutral(MODEL.model)
+    q[MODEL.q] = position
+    pinocchio.framesForwardKinematics(MODEL.model, DATA, q)
+    quaternions = [pinocchio.Quaternion(DATA.oMf[frame].rotation).coeffs() for frame in _IMU_FRAMES]
     return np.array([[w, x, y, z] for x, y, z, w in quaternions])
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pinocchio
 import pytest
-from simulated_robot import _DATA, _MODEL, GEAR, MIDDLE, ROBOT, SimulatedRobot, attitudes, only, signals
+from simulated_robot import DATA, GEAR, MIDDLE, MODEL, ROBOT, SimulatedRobot, attitudes, only, signals
 
 from atalante_control.model import ExoskeletonParameters
 from atalante_hal.robot import FEET, JOINTS
@@ -47,10 +47,10 @@ class Standing:
 def test_tilt_agrees_with_the_kinematic_model(seed: int, foot: int):
     rng = np.random.default_rng(seed)
     position = np.clip(MIDDLE + 0.2 * rng.standard_normal(12), ROBOT.position_min, ROBOT.position_max)
-    q = pinocchio.neutral(_MODEL.model)
-    q[_MODEL.q] = position
-    pinocchio.framesForwardKinematics(_MODEL.model, _DATA, q)
-    up = _DATA.oMf[_MODEL.model.getFrameId(f"{FEET[foot]}_foot")].rotation[2]
+    q = pinocchio.neutral(MODEL.model)
+    q[MODEL.q] = position
+    pinocchio.framesForwardKinematics(MODEL.model, DATA, q)
+    up = DATA.oMf[MODEL.model.getFrameId(f"{FEET[foot]}_foot")].rotation[2]
     tibia = attitudes(position)[2 + foot].tolist()
     tilt = sole_tilt(tibia, position[SA + 6 * foot], position[HA + 6 * foot], TOE_OUT if foot == 0 else -TOE_OUT)
     assert tilt == pytest.approx(tuple(up[:2]), abs=1e-9)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pinocchio
 import pytest
-from simulated_robot import _DATA, _MODEL, GEAR, MIDDLE, ROBOT, SimulatedRobot, attitudes, only, signals
+from simulated_robot import DATA, GEAR, MIDDLE, MODEL, ROBOT, SimulatedRobot, attitudes, only, signals
 
 from atalante_control.model import ExoskeletonParameters
 from atalante_hal.robot import FEET, JOINTS
@@ -177,13 +177,13 @@ class TestPosture:
         rng = np.random.default_rng(seed)
         position = np.clip(MIDDLE + 0.1 * rng.standard_normal(12), ROBOT.position_min, ROBOT.position_max)
         turn = multiplied(rotation(2, rng.uniform(-3.0, 3.0)), rotation(0, rng.uniform(-0.1, 0.1)))
-        q = pinocchio.neutral(_MODEL.model)
-        q[_MODEL.q] = position
-        pinocchio.forwardKinematics(_MODEL.model, _DATA, q)
+        q = pinocchio.neutral(MODEL.model)
+        q[MODEL.q] = position
+        pinocchio.forwardKinematics(MODEL.model, DATA, q)
         w, x, y, z = turn
         world = pinocchio.Quaternion(w, x, y, z).toRotationMatrix()
-        ankles = [world @ _DATA.oMi[_MODEL.model.getJointId(f"{side}_SA")].translation for side in FEET]
-        shanks = [world @ _DATA.oMi[_MODEL.model.getJointId(f"{side}_SK")].rotation[:, 2] for side in FEET]
+        ankles = [world @ DATA.oMi[MODEL.model.getJointId(f"{side}_SA")].translation for side in FEET]
+        shanks = [world @ DATA.oMi[MODEL.model.getJointId(f"{side}_SK")].rotation[:, 2] for side in FEET]
         left = world[:2, 1] / np.linalg.norm(world[:2, 1])
         imus = [multiplied(turn, attitude).tolist() for attitude in attitudes(position)]
         posture = posture_of(imus[1], imus[2:], position[KNEES].tolist())
