@@ -103,7 +103,7 @@ def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
         if not reason and (text := _failure(request)):
             return Refusal("START_FAILED", "error", text)
     if not reason and request.supervisor in _ENABLING:
-        reason = implausible_torque(robot, request.drive_state, request.torque) or ""
+        reason = implausible_torque(robot, request.drive_state, request.torque)
     return Refusal("START_REFUSED", "warning", REFUSED + reason) if reason else None
 
 
@@ -233,8 +233,8 @@ def stop_text(stop_requested: bool) -> str:
     return "the operator asked to stop" if stop_requested else "the dead-man switch was released or the pendant is lost"
 
 
-def implausible_torque(robot: Robot, drive_state: Vector, torque: Vector) -> str | None:
-    """Return a sentence about a drive whose reported torque is impossible in its state; None if there is no such drive.
+def implausible_torque(robot: Robot, drive_state: Vector, torque: Vector) -> str:
+    """Return a sentence about a drive whose reported torque is impossible in its state; empty if there is no such drive.
 
     Args:
         robot: torque limits, and `idle_torque`, the largest torque that an idle drive may report.
@@ -246,7 +246,7 @@ def implausible_torque(robot: Robot, drive_state: Vector, torque: Vector) -> str
     allowed = np.where(on, robot.torque_max, 0.0) + idle
     wrong = np.flatnonzero(~(np.abs(torque) <= allowed))  # `~(... <= ...)` is also True for NaN
     if not wrong.size:
-        return None
+        return ""
     joint = int(wrong[0])
     state = _name(float(drive_state[joint]))
     limit = f"its limit of {robot.torque_max[joint]:.0f} Nm" if on[joint] else f"{idle:g} Nm, because it is not enabled"

@@ -62,7 +62,8 @@ _AT_STOP = 0.005
 #: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since then.
 #: If the last forces of a foot are older than `_FORCES_VALID`, the `Drive` records of its ankles are cleared.
 _FORCES_VALID = 5
-_NEVER = 1 << 30
+#: Limit of the repeated readings of a signal that may be constant forever [samples].
+_NO_LIMIT = 1 << 30
 #: Index of each ankle joint in JOINTS.
 _ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
 #: For each ankle joint: index of its foot in FEET.
@@ -128,7 +129,7 @@ class Stillness:
         self._repeats = np.full(size, 0)
         # Convert the limits from cycles to samples. Example: with `every` = 16, 50 cycles become (50 - 15) // 16 = 2 samples.
         # The 15 cycles are subtracted because the first repeated reading may be up to 15 cycles older than its sample.
-        limit = np.full(size, _NEVER)
+        limit = np.full(size, _NO_LIMIT)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
         self._to_freeze = to_freeze

@@ -39,10 +39,9 @@ def test_permitted_torque_depends_on_the_drive_state(state: DriveState, joint: i
     most = (ROBOT.torque_max[joint] if on else 0.0) + IDLE
     torque = np.zeros(12)
     torque[joint] = sign * most
-    assert implausible_torque(ROBOT, states, torque) is None
+    assert implausible_torque(ROBOT, states, torque) == ""
     torque[joint] = sign * np.nextafter(most, np.inf)
     why = implausible_torque(ROBOT, states, torque)
-    assert why is not None
     limit = f"its limit of {ROBOT.torque_max[joint]:.0f} Nm" if on else "2 Nm, because it is not enabled"
     assert why == f"the drive of {JOINTS[joint]} reports {sign * most:.0f} Nm in {state.name}; must be within {limit}"
 
@@ -50,7 +49,6 @@ def test_permitted_torque_depends_on_the_drive_state(state: DriveState, joint: i
 @pytest.mark.parametrize("torque", [np.nan, np.inf, -np.inf])
 def test_torque_of_nan_or_infinity_is_implausible(torque: float):
     why = implausible_torque(ROBOT, np.full(12, float(D.OPERATION_ENABLED)), np.full(12, torque))
-    assert why is not None
     assert "left_FH" in why
 
 
