@@ -23,7 +23,8 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, number_of
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.safety_monitor import DRIVE_NODES, SafetyMonitor, Verdict
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
+from atalante_hal.safety.safety_monitor import SafetyMonitor, Verdict
 from atalante_hal.safety.start import powered, words_towards_operation
 from atalante_hal.safety.state_machine import Conditions
 from atalante_hal.transceiver import RECEIVE_BUDGET, FrameTap, Transceiver
@@ -253,7 +254,7 @@ class Hal:
         self._errors = 0
         state, control, safety_monitor = self.state, self._commands.control, self._safety_monitor
         if safety_monitor.lowered:
-            control[[node in safety_monitor.lowered for node in DRIVE_NODES]] = Controlword.DISABLE_VOLTAGE
+            control[[node in safety_monitor.lowered for node in JOINT_NODES]] = Controlword.DISABLE_VOLTAGE
         if safety_monitor.start_cycles_left and (
             state.supervisor in (_S.LOWER, _S.FAULT) or (state.supervisor is _S.HOLD and safety_monitor.start_prevented)
         ):

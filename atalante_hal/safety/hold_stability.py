@@ -29,6 +29,7 @@ import numpy.typing as npt
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import Vector
 from atalante_hal.wire.cia402 import DriveState
 
@@ -200,7 +201,7 @@ class HoldStability:
         return tuple(
             Finding(
                 Dtc.HOLD_UNSTABLE,
-                JOINTS[joint].upper(),
+                JOINT_NODES[joint],
                 float(count),
                 True,
                 f"{JOINTS[joint]} {motion}; its drive is switched off",

@@ -27,7 +27,7 @@ from atalante_hal.safety.hold_stability import HoldStability, Measured
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_MESSAGES, TRUNK_NODES, rows_of
+from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_MESSAGES, JOINT_NODES, TRUNK_NODES, rows_of
 from atalante_hal.safety.start import (
     ENABLE_CYCLES,
     PROGRAM_ENDS,
@@ -55,8 +55,6 @@ FINISH_STEP_CYCLES = 6000
 #: The answer to a command takes two cycles, and frames may be late by four cycles.
 RECALL_CYCLES = 6
 
-#: DBC names of the drives, in joint order.
-DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 #: Codes of an IMU whose values are rejected.
@@ -368,7 +366,7 @@ class SafetyMonitor:
         so the codes of these IMUs end the walk, too.
         """
         memory = self.memory
-        ends = memory.walk_ends(DRIVE_NODES)
+        ends = memory.walk_ends(JOINT_NODES)
         unusable = {*memory.nodes_of(_REJECTED), *(IMU_NODES[imu] for imu in self._state.implausible_imus)}
         return ends | _REJECTED | {Dtc.IMU_IMPLAUSIBLE} if unusable.issuperset(TRUNK_NODES) else ends
 
@@ -392,7 +390,7 @@ class SafetyMonitor:
         self._check_derating()
         if state.drive_state.tobytes() == _ENABLED:
             return
-        for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True):
+        for node, drive in zip(JOINT_NODES, state.drive_state.tolist(), strict=True):
             if drive in _FAULTY:
                 # If a drive has sent an emergency, only the emergency determines the reaction.
                 if not self._heartbeats.has_emergency(node) and (nodes_ready or state.supervisor is not _S.OFF):
@@ -411,7 +409,7 @@ class SafetyMonitor:
             return
         share = (limit / full).tolist()
         for index, (node, mine, twins) in enumerate(
-            zip(DRIVE_NODES, share, share[len(share) // 2 :] + share, strict=False)
+            zip(JOINT_NODES, share, share[len(share) // 2 :] + share, strict=False)
         ):
             weak = mine < self._robot.thresholds.derated_imbalance * twins
             bucket = qualify(self._weak.pop(node, SETTLED), good=not weak)
@@ -440,7 +438,7 @@ class SafetyMonitor:
         self._acknowledged = False
         if pendant.started and state.supervisor is not _S.ACTIVE and not self._ending:
             faulty = {
-                node for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True) if drive in _FAULTY
+                node for node, drive in zip(JOINT_NODES, state.drive_state.tolist(), strict=True) if drive in _FAULTY
             }
             self._heartbeats.acknowledge(faulty)
             self._acknowledged = True
@@ -450,7 +448,7 @@ class SafetyMonitor:
                     # A drive that is off now has not been tested since the robot entered READY, or has never been tested.
                     # So each drive that is off now is switched off again if the start fails.
                     on = powered(state.drive_state).tolist()
-                    self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
+                    self._kept_off.update(node for node, is_on in zip(JOINT_NODES, on, strict=True) if not is_on)
             self.start_cycles_left = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_cycles_left:
             self.start_cycles_left -= 1
@@ -490,9 +488,9 @@ class SafetyMonitor:
                 self._pass_test()
         elif proof.running:
             if failure := proof.evaluate(state.position, state.foot_force[..., 2]):
-                self._kept_off.update(DRIVE_NODES[joint] for joint in proof.failed)
+                self._kept_off.update(JOINT_NODES[joint] for joint in proof.failed)
                 for joint in proof.failed:
-                    finding = Finding(Dtc.TORQUE_DIRECTION, DRIVE_NODES[joint], proof.mobility[joint], True, failure)
+                    finding = Finding(Dtc.TORQUE_DIRECTION, JOINT_NODES[joint], proof.mobility[joint], True, failure)
                     self.memory.raise_finding(state.cycle, finding)
                     self._reports.append(finding)
                 return Refusal("START_FAILED", "error", failure)
@@ -594,6 +592,6 @@ class SafetyMonitor:
         too. If the START ends before the test of the joint directions is passed, these drives are switched off again.
         """
         lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
-        off = {node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES}
+        off = {node for node in self.memory.nodes_of(lower) if node in JOINT_NODES}
         kept = self.lowered if self._state.supervisor in (_S.LOWER, _S.FAULT) else self._kept_off
         self.lowered = kept | off

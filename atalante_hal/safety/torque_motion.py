@@ -40,6 +40,7 @@ from atalante_hal.leg_model import LegModel
 from atalante_hal.robot import JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.leg_torques import History, Sample, Torques, compute, make_history, make_torques, store
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import State, Vector
 
 #: Interval between two checks of a leg [cycles]. The legs are checked alternately.
@@ -274,10 +275,10 @@ class TorqueMotion:
         found, shares = self._memory.deviations.found.tolist(), self._memory.deviations.share.tolist()
         return tuple(
             Finding(
-                Dtc.TORQUE_MOTION, joint.upper(), share, True,
+                Dtc.TORQUE_MOTION, node, share, True,
                 f"the motion of {joint} must agree with the torque that was sent, "
                 f"got a motion as with {share:.2f} times this torque",
             )
-            for joint, checks, share in zip(JOINTS, found, shares, strict=True)
+            for joint, node, checks, share in zip(JOINTS, JOINT_NODES, found, shares, strict=True)
             if checks >= CONFIRM
         )  # fmt: skip

@@ -23,6 +23,7 @@ import numpy.typing as npt
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import Vector
 
 #: Longest time from sending a torque to the report of this torque by the drive [cycles].
@@ -105,7 +106,7 @@ class TorqueTracking:
             return ()
         return tuple(
             Finding(
-                Dtc.TORQUE_TRACKING, JOINTS[joint].upper(), float(reported[joint]), True,
+                Dtc.TORQUE_TRACKING, JOINT_NODES[joint], float(reported[joint]), True,
                 f"the drive of {JOINTS[joint]} must follow the torque command of {sent[joint]:.1f} Nm, "
                 f"got a reported torque of {reported[joint]:.1f} Nm",
             )

@@ -18,7 +18,7 @@ Cycles = npt.NDArray[np.int64]
 JOINT_MESSAGES = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
 IMU_MESSAGES = tuple(f"IMU_{imu.upper()}_STATE" for imu in IMUS)
 FOOT_MESSAGES = tuple(f"FOOT_{foot.upper()}_STATE" for foot in FEET)
-#: DBC names of the nodes that send the sensor messages.
+#: DBC names of the nodes that send the sensor messages. The nodes of the joints are the drives.
 JOINT_NODES, IMU_NODES, FOOT_NODES = (
     tuple(message.removesuffix("_STATE") for message in messages)
     for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)

@@ -14,7 +14,7 @@ from atalante_hal.safety.direction import (
     LATENCY,
     TRAVEL,
 )
-from atalante_hal.safety.safety_monitor import DRIVE_NODES
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 
@@ -170,7 +170,7 @@ def test_drive_with_a_wrong_torque_stays_off_if_the_next_start_is_stopped(rig, m
     monitor = rig.hal._safety_monitor
     dtc = Dtc(check.upper())
     with monkeypatch.context() as patch:
-        finding = Finding(dtc, DRIVE_NODES[KNEE], 0.0, True, "wrong torque")
+        finding = Finding(dtc, JOINT_NODES[KNEE], 0.0, True, "wrong torque")
         checks = SimpleNamespace(check=lambda *_: (finding,), restart=lambda: None)
         patch.setattr(monitor, check, checks)
         rig.until(S.LOWER, 5)

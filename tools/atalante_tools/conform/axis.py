@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from atalante_hal.robot import JOINTS
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.safety.start import STALLED_CYCLES
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import Frames
@@ -61,7 +61,7 @@ class Axis:
 
     def __init__(self, tester: NodeTester) -> None:
         self.tester = tester
-        self.joint = [joint.upper() for joint in JOINTS].index(tester.node.name)
+        self.joint = JOINT_NODES.index(tester.node.name)
         self._prefix = tester.node.name.rsplit("_", 1)[1]
         self._own = tester.network.message(tester.command.message.name)
         self.other_data_id = next(

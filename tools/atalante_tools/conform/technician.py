@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
-from atalante_hal.robot import JOINTS
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_tools.console.terminal import print_message
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class EmulatorTechnician:
             case Action.POWER_UP:
                 pass  # nothing to do, because the emulated robot is powered on at the start of the examination
             case Action.OVERHEAT | Action.COOL:
-                drive = [joint.upper() for joint in JOINTS].index(node)
+                drive = JOINT_NODES.index(node)
                 self._emulator.drives.heat(drive, 150.0 if action is Action.OVERHEAT else 25.0)
             case Action.RELEASE_DEAD_MAN:
                 operator.release()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from atalante_emulator.faults import Fault
-from atalante_hal.robot import CELLS, JOINTS
+from atalante_hal.robot import CELLS
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF
 from atalante_tools.faults.checks import (
@@ -31,7 +32,6 @@ _COMMAND: Final = "COMMAND_LEFT_LEG"
 _PENDANT: Final = "PENDANT"
 #: Flags of a CAN FD frame from a node that is error passive.
 _ERROR_PASSIVE: Final = FLAG_FDF | FLAG_BRS | FLAG_ESI
-_DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
 
 
 def _lost(name: str, message: str, frames: int | None, *, node: str, recovers: bool = True) -> Case:
@@ -87,7 +87,7 @@ SCENARIOS: Final = (
     Scenario(
         "F04",
         (
-            *(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
+            *(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in JOINT_NODES),
             # Frames of a swing leg are lost. Injected forces load the right foot, so the HAL treats the left leg as swing leg.
             # After 5 lost frames in a row, the swing leg finishes its step (FINISH_STEP). The tenth lost frame leads to HOLD.
             *(

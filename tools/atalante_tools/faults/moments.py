@@ -29,7 +29,7 @@ import numpy as np
 
 from atalante_emulator.faults import Fault
 from atalante_hal.robot import JOINTS, LEG_JOINTS
-from atalante_hal.safety.safety_monitor import DRIVE_NODES
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.safety.start import ENABLE_CYCLES, powered
 from atalante_hal.types import SupervisorState, Vector
 from atalante_tools.console.options import PYBULLET
@@ -258,7 +258,7 @@ def _unlimited(run: Observation, motor: Fault, starts: Sequence[int]) -> list[tu
         starts: cycles in which the operator pressed START.
     """
     begin = run.first + motor.start
-    leg = DRIVE_NODES.index(motor.target) // len(LEG_JOINTS)
+    leg = JOINT_NODES.index(motor.target) // len(LEG_JOINTS)
     fresh = run.age[:, run.messages.index(f"{motor.target}_STATE")] < _SILENT
     found = []
     for first in (begin, *(start for start in starts if start >= begin)):
@@ -276,7 +276,7 @@ def _strength(motors: Sequence[Fault]) -> Vector:
     """
     strength = np.ones(len(JOINTS))
     for fault in motors:
-        joint = DRIVE_NODES.index(fault.target)
+        joint = JOINT_NODES.index(fault.target)
         strength[joint] = max(strength[joint], abs(float(fault["share"])))
     return strength
 
@@ -291,7 +291,7 @@ def _sag_limits(stimuli: Sequence[Stimulus]) -> Vector:
     for stimulus in stimuli:
         if isinstance(stimulus, Fault) and stimulus.kind in SAG_OF:
             nodes = {stimulus.target.removesuffix("_STATE"), dict(stimulus.parameters).get("other")}
-            for leg in {DRIVE_NODES.index(node) // len(limits[0]) for node in nodes & set(DRIVE_NODES)}:
+            for leg in {JOINT_NODES.index(node) // len(limits[0]) for node in nodes & set(JOINT_NODES)}:
                 limits[leg] = np.maximum(limits[leg], SAG_OF[stimulus.kind])
     return limits.ravel()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from atalante_emulator.faults import Fault
-from atalante_hal.robot import FEET, IMUS, JOINTS
+from atalante_hal.safety.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import not_enabled_in_motion
 from atalante_tools.faults.scenario import Case, OperatorAction, Scenario
@@ -13,8 +13,7 @@ from atalante_tools.faults.scenario import Case, OperatorAction, Scenario
 _KNEE: Final = "LEFT_SK"
 _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
-_DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
-_SENSORS: Final = (*(f"IMU_{name.upper()}" for name in IMUS), *(f"FOOT_{name.upper()}" for name in FEET))
+_SENSORS: Final = (*IMU_NODES, *FOOT_NODES)
 #: Time without a frame after which the HAL reports a timeout of an IMU or a foot [cycles].
 _SENSOR_TIMEOUT: Final = 10
 
@@ -39,7 +38,7 @@ SCENARIOS: Final = (
     Scenario(
         "F19",
         (
-            *(Case(drive, (Fault("silence", drive),), node=drive, recovers=False) for drive in _DRIVES),
+            *(Case(drive, (Fault("silence", drive),), node=drive, recovers=False) for drive in JOINT_NODES),
             *(
                 Case(
                     sensor,

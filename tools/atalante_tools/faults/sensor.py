@@ -6,7 +6,8 @@ import math
 from typing import Final
 
 from atalante_emulator.faults import Fault
-from atalante_hal.robot import CELLS, FEET, IMUS
+from atalante_hal.robot import CELLS
+from atalante_hal.safety.plausibility.finding import FOOT_NODES, IMU_NODES
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import start_is_rejected
 from atalante_tools.faults.scenario import MID_SWING, Case, OperatorAction, Scenario, invalid_code
@@ -16,8 +17,6 @@ _HOLD: Final = SupervisorState.HOLD
 _KNEE: Final = "LEFT_SK"
 #: Joint that hardly moves while the left leg swings, so that a small jump of the joint encoder is detectable.
 _STILL: Final = "RIGHT_FH"
-_IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
-_FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
 #: Probability that a frame arrives twice. The HAL tolerates this probability permanently. Above 0.2, the HAL reports F63.
 _OFTEN: Final = 0.15
 #: Part of a case name -> permanent communication fault during which the HAL must still detect a drifting encoder.
@@ -38,8 +37,8 @@ _TOLERATED: Final = {
 def _imu(kind: str, cycles: int, *, tolerated: int) -> tuple[Case, ...]:
     """Return one test case per IMU, and one test case with a short fault during which the walk must continue."""
     return (
-        *(Case(imu, (Fault(kind, imu, 0, cycles),), node=imu) for imu in _IMUS),
-        Case(f"for {tolerated} cycles", (Fault(kind, _IMUS[0], 0, tolerated),), state=_ACTIVE, node=_IMUS[0]),
+        *(Case(imu, (Fault(kind, imu, 0, cycles),), node=imu) for imu in IMU_NODES),
+        Case(f"for {tolerated} cycles", (Fault(kind, IMU_NODES[0], 0, tolerated),), state=_ACTIVE, node=IMU_NODES[0]),
     )
 
 
@@ -203,11 +202,13 @@ SCENARIOS: Final = (
             for rate in (2.5, -2.5)
         ),
     ),
-    Scenario("F30", _imu("imu_invalid", 30, tolerated=5), permanent=Case("torso", (Fault("imu_invalid", _IMUS[0]),))),
     Scenario(
-        "F31", _imu("imu_saturated", 30, tolerated=5), permanent=Case("torso", (Fault("imu_saturated", _IMUS[0]),))
+        "F30", _imu("imu_invalid", 30, tolerated=5), permanent=Case("torso", (Fault("imu_invalid", IMU_NODES[0]),))
     ),
-    Scenario("F32", tuple(Case(imu, (Fault("imu_frozen", imu, 0, 200),), node=imu) for imu in _IMUS)),
+    Scenario(
+        "F31", _imu("imu_saturated", 30, tolerated=5), permanent=Case("torso", (Fault("imu_saturated", IMU_NODES[0]),))
+    ),
+    Scenario("F32", tuple(Case(imu, (Fault("imu_frozen", imu, 0, 200),), node=imu) for imu in IMU_NODES)),
     Scenario(
         "F33",
         tuple(
@@ -216,7 +217,7 @@ SCENARIOS: Final = (
                 (Fault("cell_stuck", foot, 0, 300, cell=cell, force=force),),
                 node=foot,
             )
-            for foot in _FEET
+            for foot in FOOT_NODES
             for cell, force in zip(CELLS, (400.0, 0.0, -50.0, 61.0), strict=True)
         ),
     ),
@@ -228,7 +229,7 @@ SCENARIOS: Final = (
         tuple(
             Case(
                 name,
-                (*_standing(_FEET[0], left), *_standing(_FEET[1], right)),
+                (*_standing(FOOT_NODES[0], left), *_standing(FOOT_NODES[1], right)),
                 first_faulty=600,
                 observed=1000,
                 suspended=True,
@@ -244,14 +245,14 @@ SCENARIOS: Final = (
         "F76",
         tuple(
             Case(f"{foot}, all cells -200 N", (Fault("cell_offset", foot, 0, 300, force=-200.0),), node=foot)
-            for foot in _FEET
+            for foot in FOOT_NODES
         ),
     ),
     Scenario(
         "F77",
         tuple(
             Case(f"{foot}, all cells +200 N", (Fault("cell_offset", foot, 0, 1000, force=200.0),), node=foot)
-            for foot in _FEET
+            for foot in FOOT_NODES
         ),
     ),
     Scenario(
@@ -420,7 +421,7 @@ SCENARIOS: Final = (
         (
             *(
                 _never_ready(f"{imu}, wrong sign along Z", Fault("imu_inverted", imu, axis="Z"), node=imu)
-                for imu in _IMUS[:2]
+                for imu in IMU_NODES[:2]
             ),
             *(
                 Case(
@@ -430,13 +431,13 @@ SCENARIOS: Final = (
                     node=imu,
                     recovers=False,
                 )
-                for imu in _IMUS[2:]
+                for imu in IMU_NODES[2:]
             ),
             *(
                 _never_ready(
                     f"{imu}, turned in its mount", Fault("imu_turned", imu, axis="X", degrees=5.0), node="IMU_TORSO"
                 )
-                for imu in _IMUS[:2]
+                for imu in IMU_NODES[:2]
             ),
             Case(
                 "IMU_TORSO, wrong sign while walking",

@@ -24,6 +24,7 @@ from atalante_emulator.emulator import Emulator
 from atalante_emulator.faults import Fault
 from atalante_emulator.mechanics import Mechanics
 from atalante_hal.robot import JOINTS, LEG_JOINTS
+from atalante_hal.safety.plausibility.finding import JOINT_MESSAGES
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.guide.episode import RATE, Push, Setup
@@ -38,10 +39,9 @@ _LEG: Final = len(LEG_JOINTS)
 _MASSES: Final = (
     "pelvis_mass", "frontal_hip_mass", "transverse_hip_mass", "thigh_mass", "shank_mass", "ankle_mass", "foot_mass",
 )  # fmt: skip
-#: Command messages: `Condition.delay` delays all of their frames, and `Condition.loss` drops some of their frames.
+#: Command messages: `Condition.delay` delays all of their frames. `Condition.loss` drops some of their frames, and some state
+#: messages of the drives.
 _COMMANDS: Final = ("COMMAND_LEFT_LEG", "COMMAND_RIGHT_LEG")
-#: State messages of the drives: `Condition.loss` drops some of their frames.
-_STATES: Final = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
 
 
 class RobotStep(NamedTuple):
@@ -226,7 +226,7 @@ def _faults(condition: Condition) -> list[Fault]:
     """Return the communication faults that a `Condition` requires."""
     faults = []
     if condition.loss:
-        faults += [Fault("drop", message, 0, None, p=condition.loss) for message in (*_STATES, *_COMMANDS)]
+        faults += [Fault("drop", message, 0, None, p=condition.loss) for message in (*JOINT_MESSAGES, *_COMMANDS)]
     if condition.delay:
         faults += [Fault("delay", message, 0, None, by=condition.delay) for message in _COMMANDS]
     return faults

@@ -21,7 +21,8 @@ from atalante_hal.robot import load_robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.fault_memory import FaultMemory
-from atalante_hal.safety.safety_monitor import DRIVE_NODES, RECALL_CYCLES
+from atalante_hal.safety.plausibility.finding import JOINT_NODES
+from atalante_hal.safety.safety_monitor import RECALL_CYCLES
 from atalante_hal.safety.state_machine import MOVING
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
@@ -291,11 +292,11 @@ class HalSteps:
         if not environment.enabled:
             hal.state.drive_state[1] = DriveState.QUICK_STOP_ACTIVE
         findings = [
-            Finding(self._dtc[environment.reaction], DRIVE_NODES[0 if environment.mine else 1], 0.0, True, "input")
+            Finding(self._dtc[environment.reaction], JOINT_NODES[0 if environment.mine else 1], 0.0, True, "input")
         ]
         monitor._evaluate(findings)
         left = monitor.start_cycles_left
-        lowered = DRIVE_NODES[0] in monitor.lowered
+        lowered = JOINT_NODES[0] in monitor.lowered
         for start in {NO_START} if not left else {LAST_START, START} if before.start == START else {min(left, START)}:
             after = Supervision(hal.state.supervisor, start, monitor.enabling, lowered)
             yield Decision(after, monitor.start_prevented, after.supervisor is not before.supervisor)
@@ -313,7 +314,7 @@ class HalSteps:
         self._reset()
         self._write(state)
         if prevented:
-            hal._safety_monitor.memory.raise_dtc(_CYCLE, self._dtc[Reaction.HOLD], DRIVE_NODES[1])
+            hal._safety_monitor.memory.raise_dtc(_CYCLE, self._dtc[Reaction.HOLD], JOINT_NODES[1])
             hal._safety_monitor.memory.close_cycle(_CYCLE)
         hal.state.drive_state[0] = drive
         if not hal.moving:
@@ -365,9 +366,9 @@ class HalSteps:
         monitor.moving = state.supervisor in MOVING
         monitor.start_cycles_left, monitor.enabling = START_CYCLES[state.start], state.enabling
         if state.lowered:
-            monitor.lowered.add(DRIVE_NODES[0])
+            monitor.lowered.add(JOINT_NODES[0])
             if state.supervisor not in (SupervisorState.LOWER, SupervisorState.FAULT):
-                monitor._kept_off.add(DRIVE_NODES[0])
+                monitor._kept_off.add(JOINT_NODES[0])
 
 
 def _own_request(before: Reception, own: list[int], after: Reception) -> int:
