@@ -174,13 +174,11 @@ class Transceiver:
         first, scratch = count, self.scratch
         try:
             count += self.bus.receive(scratch[first:] if first else scratch)
+        except BusError as error:
+            self._report_down(error, 0.0 if cycle is None else patience)
+        else:
             if cycle is not None and (first or not cycle.begins(scratch, count)):
                 count = self._receive_rest(first, count, cycle, patience)
-        except BusError as error:
-            self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
-            count = first
-            if cycle is not None:  # Without a pause, lock-step cycles on a failing bus would run as fast as possible.
-                time.sleep(min(patience, _DOUBTFUL_PATIENCE))
         if self.tap is not None:
             self.tap.received(scratch[first:] if first else scratch, count - first)
         if count > self._most:
@@ -297,12 +295,24 @@ class Transceiver:
         if full is not error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
 
+    def _report_down(self, error: BusError, patience: float) -> None:
+        """Report an error of `receive`, and pause. Without a pause, lock-step cycles on a failing bus would run too fast."""
+        self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
+        time.sleep(min(patience, _DOUBTFUL_PATIENCE))
+
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:
         self._found.append(Finding(dtc, self._node, value, confirmed, text))
         self.quiet = False
 
     def _receive_rest(self, first: int, count: int, cycle: ReceiveImage, patience: float) -> int:
-        """Wait until every expected message of `cycle` has arrived in `scratch[first:]`, at most `patience` [s]."""
+        """Wait until every expected message of `cycle` has arrived in `scratch[first:]`, at most `patience` [s].
+
+        An error of the bus ends the wait. The frames that arrived before the error are kept: if one channel of a `JoinedBus` is
+        lost, these are the frames of the other channels.
+
+        Returns:
+            Number of frames now in `scratch`.
+        """
         missing = cycle.expected_ages()
         shortest = min(patience, _DOUBTFUL_PATIENCE)
         # If every node has timed out, `missing` is empty. In this case, receive frames until the bus is silent.
@@ -317,7 +327,11 @@ class Transceiver:
             if remaining <= 0.0 or not (missing or until_silent):
                 break
             first = count
-            got = self.bus.receive(self.scratch[count:], remaining)
+            try:
+                got = self.bus.receive(self.scratch[count:], remaining)
+            except BusError as error:
+                self._report_down(error, patience)
+                break
             if got == 0:
                 break
             count += got

@@ -349,14 +349,20 @@ def test_bus_down_while_receiving_is_reported_and_not_raised(desk: Desk):
     assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
     assert (event.text, event.value, event.node) == ("bench is down: gone", 0.0, "HAL")
-    desk.bus.arrivals = [ids(1), BusDown("gone")]
-    begun = desk.bus.clock.now
-    assert desk.transceiver.receive(0, image(0, 1), 0.01) == 0
-    assert desk.bus.clock.now == begun + 0.01
     for patience, paused in ((0.0, 0.0), (0.01, 0.01), (60.0, 0.1)):
         desk.bus.arrivals, begun = [BusDown("gone")], desk.bus.clock.now
         assert desk.transceiver.receive(0, image(0, 1), patience) == 0
         assert desk.bus.clock.now == begun + paused
+
+
+def test_frames_received_before_an_error_of_the_bus_are_kept_and_logged(desk: Desk):
+    """The bus has several channels, and one of them is lost."""
+    desk.bus.arrivals, begun = [ids(1), BusDown("gone")], desk.bus.clock.now
+    assert desk.transceiver.receive(0, image(0, 1), 0.01) == 1
+    assert desk.transceiver.scratch["can_id"][0] == 1
+    assert desk.tap.received_ids == [[1]]
+    assert desk.bus.clock.now == begun + 0.01
+    assert desk.evaluate() == {"BUS_DOWN": True}
 
 
 @pytest.mark.parametrize(
