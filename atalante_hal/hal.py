@@ -90,6 +90,8 @@ class Hal:
         )
         self._limiter = Limiter(robot, PERIOD)
         self._torque_sent = self.state.torque_sent = self._limiter.last.copy()
+        # Copy of the measured motion for the limiter, because a controller may write into the arrays of the state by mistake.
+        self._motion = self._parts.motion.copy()
         self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
         self._errors = 0  # number of consecutive cycles in which the controller raised an exception
         self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
@@ -170,6 +172,7 @@ class Hal:
         if verdict is not None:
             self._apply(verdict)
         self._torque_sent[:] = self._limiter.last
+        self._motion[:] = parts.motion
         header = self._header
         header[0], header[1] = cycle, state.time
         header[7] += count
@@ -221,7 +224,7 @@ class Hal:
         if (shape := np.shape(command.torque)) != (len(JOINTS),):
             raise ValueError(f"the torque must have shape ({len(JOINTS)},), got {shape}")
         step = None if command.step is None else operator.index(command.step)
-        limited = self._limiter.apply(command.torque, self._parts.motion)
+        limited = self._limiter.apply(command.torque, self._motion)
         if not limited.finite:
             safety_monitor.report(Dtc.CMD_NONFINITE, "the commanded torque must be finite, got NaN or infinity")
             return self._commands.send_prepared_hold(self.state.cycle)
@@ -290,7 +293,7 @@ class Hal:
         on = powered(self.state.drive_state)
         torque = np.where(on, self.state.torque, 0.0)
         if on.all() and self._safety_monitor.enabling:
-            self._limiter.apply(torque, self._parts.motion)
+            self._limiter.apply(torque, self._motion)
         else:
             self._limiter.restart(torque)
             self._safety_monitor.enabling = True
@@ -300,7 +303,7 @@ class Hal:
     def _test_directions(self) -> None:
         """Limit and send the torques with which the HAL tests the direction of each joint."""
         proof = self._safety_monitor.proof
-        self._limiter.apply(proof.torque(self.state.position, self.state.velocity), self._parts.motion)
+        self._limiter.apply(proof.torque(self.state.position, self.state.velocity), self._motion)
         proof.sent(self._limiter.last)
         self._commands.torque[:] = self._limiter.last
 
@@ -322,7 +325,7 @@ class Hal:
         if self._errors > BRIDGED_ERRORS:
             safety_monitor.report(Dtc.CONTROLLER_LOST, Dtc.CONTROLLER_LOST.meaning)
         elif safety_monitor.walking:
-            self._limiter.apply(self._torque_sent, self._parts.motion)
+            self._limiter.apply(self._torque_sent, self._motion)
             self._commands.torque[:] = self._limiter.last
             return self._send_command()
         return self._commands.send_prepared_hold(self.state.cycle)

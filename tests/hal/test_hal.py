@@ -19,6 +19,7 @@ from atalante_hal.wire.frame import new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 S = SupervisorState
+KNEE = JOINTS.index("left_SK")
 
 
 def torques(rig) -> np.ndarray:
@@ -208,6 +209,16 @@ def test_state_contains_the_limited_torque_of_the_last_command(rig):
     assert sent.tobytes() == little.tobytes()
     assert state.torque_sent.tobytes() == before.tobytes(), "the state of a cycle changes only with the next read"
     assert rig.hal.read().torque_sent.tobytes() == little.tobytes()
+
+
+def test_controller_that_writes_into_the_state_does_not_change_the_limits(rig):
+    rig.until(S.ACTIVE)
+    state = rig.hal.read()
+    requested = state.torque_sent + 0.1
+    state.position += 0.5  # such as `error = state.position; error -= rest` in a controller
+    state.position[KNEE] = rig.hal.robot.position_max[KNEE] + 1.0
+    state.velocity[:] = rig.hal.robot.top_speed
+    assert rig.hal.write(Command(requested, np.zeros(8))).tobytes() == requested.tobytes()
 
 
 def test_joint_outside_the_guide_is_pending_and_outside_for_long_leads_to_full_assist(rig):
