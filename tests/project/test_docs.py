@@ -20,7 +20,9 @@ from atalante_control.airwalk.config import AirwalkConfig
 from atalante_control.guide.disturbance import HandOver
 from atalante_control.walking.config import WALK_GUIDE
 from atalante_hal.bus.adapters import ADAPTERS
+from atalante_hal.safety.diagnostics import Dtc
 from atalante_tools.cli import COMMANDS, cli
+from atalante_tools.faults.matrix import load_matrix
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -203,3 +205,14 @@ def test_hand_over_boxes_in_the_pages_are_those_of_the_controllers() -> None:
     assert f"fades out within {1000.0 * air.blend:g} ms; at hip and knee of a guided leg it {fading}" in paper
     for page in (paper, PAGES["docs/glossary.md"]):
         assert f"{hip:g} Nm and {knee:g} Nm" in page
+
+
+def test_examples_of_a_new_diagnostic_and_a_new_fault_fit_into_the_lists() -> None:
+    """The new code follows the last one, so no number changes. The new fault has the next free ID."""
+    diagnostic, fault = PAGES["docs/howto/diagnostic.md"], PAGES["docs/howto/fault.md"]
+    assert f"at the end of `Dtc` in `atalante_hal/safety/diagnostics.py`, after `{list(Dtc)[-1].name}`" in diagnostic
+    new = f"F{max(int(id_[1:]) for id_ in load_matrix()) + 1}"
+    for use in (f"| {new} | a foot is overloaded |", f'"{new}",', f"atalante faults run {new}`"):
+        assert use in fault, use
+    (table,) = re.findall(r"`(\w+)` of `tests/hal/safety/test_diagnostics.py`", diagnostic)
+    assert f"\n{table} = {{" in (ROOT / "tests/hal/safety/test_diagnostics.py").read_text()
