@@ -1,29 +1,37 @@
 """Parallel function calls in processes or on a cluster, used by the gait library and the fault campaign.
 
-The calls use `joblib.Parallel` with its own processes, or with the workers of a dask scheduler.
+The calls use the processes of `joblib.Parallel`, or the workers of a dask scheduler.
 """
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import signal
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import resource_tracker
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
+#: Part of the message of dask if the scheduler cannot load the calls. The scheduler imports the function of a call.
+_FOREIGN: Final = "Error during deserialization of the task graph"
+#: Longest time in which the first worker must connect to the scheduler [s].
+_WORKER_TIMEOUT: Final = 10.0
 #: After this number of process crashes, the calls run one at a time. A crash then loses the result of one call only.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 _LOKY_THREAD: Final = "ExecutorManagerThread"
+#: Lock for the threads of a dask worker. Calls use the global state of their process, so only one call may be active.
+_one_at_a_time: Final = threading.Lock()
 
 
 class FanOutError(RuntimeError):
@@ -53,6 +61,7 @@ def fan_out(
         tasks: argument of each call.
         jobs: number of processes on this computer. With 1, the calls run in this process.
         cluster: address of a dask scheduler such as tcp://127.0.0.1:8786. The project must be installed on its workers.
+            A worker process runs one call at a time, even if the worker has several threads.
         patience: longest time between two results [s], or None for no limit. On a cluster there is no limit.
         on_lost: function called with a message when a process of this computer has ended unexpectedly, for example for
             lack of memory. The calls without a result are then repeated in new processes. After 3 unexpected ends,
@@ -60,55 +69,53 @@ def fan_out(
             repeated.
 
     Raises:
-        FanOutError: If joblib or dask is missing, or the scheduler does not respond.
-        LostProcessError: If calls have no result because their processes ended unexpectedly. The other calls were finished.
+        FanOutError: If joblib or dask is missing, the scheduler does not respond or has no worker, or its connection is lost.
+        LostProcessError: If calls have no result because their processes ended unexpectedly. The other calls of this computer
+            were finished.
         TimeoutError: If no result arrives within `patience`.
     """
     if jobs == 1 and not cluster:
         yield from map(call, tasks)
         return
+    if cluster:
+        yield from _on_cluster(call, tasks, cluster)
+        return
     try:
-        from joblib import Parallel, delayed, parallel_config
+        from joblib import Parallel, delayed
     except ModuleNotFoundError as error:
         raise FanOutError(
             "several processes need joblib: install it with `pip install 'atalante-hal[campaign]'`, or use --jobs 1"
         ) from error
-    with ExitStack() as stack:
-        if cluster:
-            stack.enter_context(_client(cluster))
-            stack.enter_context(parallel_config(backend="dask"))
-        pending, without_result, losses = dict(enumerate(tasks)), 0, 0
-        while pending:
-            alone = losses >= _SHARED_LOSSES
-            calls = list(pending.items())[: 1 if alone else None]
-            pool = Parallel(
-                n_jobs=-1 if cluster else jobs, return_as="generator_unordered", timeout=None if cluster else patience
-            )
-            results = None
-            try:
-                with _terminal_signals_later():
-                    results = pool(delayed(_numbered)(call, number, task) for number, task in calls)
-                for number, result in results:
-                    del pending[number]
-                    yield result
-            except multiprocessing.TimeoutError as error:  # joblib does not raise the built-in TimeoutError
-                raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
-            except BrokenProcessPool as error:
-                if on_lost is None:
-                    raise LostProcessError(f"{_lost(len(pending))}; {_REMEDY}") from error
-                losses += 1
-                if alone:
-                    del pending[calls[0][0]]
-                    without_result += 1
-                else:
-                    on_lost(f"{_lost(len(pending))}; they are repeated in new processes")
-            finally:
-                if results is not None:
-                    with warnings.catch_warnings(), _without_loky_errors():
-                        warnings.simplefilter("ignore", UserWarning)  # joblib warns about results that are not used
-                        results.close()
-        if without_result:
-            raise LostProcessError(f"{_lost(without_result)}; {_REMEDY}")
+    pending, without_result, losses = dict(enumerate(tasks)), 0, 0
+    while pending:
+        alone = losses >= _SHARED_LOSSES
+        calls = list(pending.items())[: 1 if alone else None]
+        pool = Parallel(n_jobs=jobs, return_as="generator_unordered", timeout=patience)
+        results = None
+        try:
+            with _terminal_signals_later():
+                results = pool(delayed(_numbered)(call, number, task) for number, task in calls)
+            for number, result in results:
+                del pending[number]
+                yield result
+        except multiprocessing.TimeoutError as error:  # joblib does not raise the built-in TimeoutError
+            raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
+        except BrokenProcessPool as error:
+            if on_lost is None:
+                raise LostProcessError(f"{_lost(len(pending))}; {_REMEDY}") from error
+            losses += 1
+            if alone:
+                del pending[calls[0][0]]
+                without_result += 1
+            else:
+                on_lost(f"{_lost(len(pending))}; they are repeated in new processes")
+        finally:
+            if results is not None:
+                with warnings.catch_warnings(), _without_loky_errors():
+                    warnings.simplefilter("ignore", UserWarning)  # joblib warns about results that are not used
+                    results.close()
+    if without_result:
+        raise LostProcessError(f"{_lost(without_result)}; {_REMEDY}")
 
 
 def _lost(calls: int) -> str:
@@ -172,9 +179,71 @@ def _without_loky_errors() -> Iterator[None]:
         threading.excepthook = before
 
 
+def _on_cluster(
+    call: Callable[[_Task], _Result], tasks: Iterable[_Task], address: str
+) -> Generator[_Result, None, None]:
+    """Call a function for many tasks on the workers of a dask scheduler, and yield the results in the order of completion.
+
+    The backend `dask` of joblib is not used: with a cluster of one thread, joblib runs the calls in the calling process.
+
+    Args:
+        call: function to call.
+        tasks: argument of each call.
+        address: address of the scheduler.
+
+    Raises:
+        FanOutError: If dask is missing, the scheduler does not respond, has no worker or cannot load the calls, or if its
+            connection is lost.
+        LostProcessError: If a call ended several workers.
+    """
+    with _client(address) as client:
+        from distributed import CancelledError, KilledWorker, as_completed
+
+        try:
+            client.wait_for_workers(1, timeout=_WORKER_TIMEOUT)
+        except TimeoutError as error:
+            raise FanOutError(
+                f"the dask scheduler at {address} has no worker: start one with `dask worker {address}`"
+            ) from error
+        futures = client.map(partial(_alone, call), list(tasks), pure=False)
+        try:
+            for future in as_completed(futures):  # type: ignore[no-untyped-call]
+                yield future.result()
+                future.release()
+        except KilledWorker as error:
+            raise LostProcessError(
+                f"a call ended several workers of {address}, for example for lack of memory; repeat the command"
+            ) from error
+        except RuntimeError as error:
+            if _FOREIGN not in str(error):
+                raise
+            raise FanOutError(
+                f"the dask scheduler at {address} must have the same versions of this project and of all packages as this program"
+            ) from error
+        except CancelledError as error:
+            raise FanOutError(
+                f"the connection to the dask scheduler at {address} is lost; repeat the command when it runs again"
+            ) from error
+        finally:
+            with suppress(Exception):  # after a lost connection, nothing can be cancelled
+                client.cancel(futures)
+
+
+def _alone(call: Callable[[_Task], _Result], task: _Task) -> _Result:
+    with _one_at_a_time:
+        return call(task)
+
+
 @contextmanager
-def _client(address: str) -> Iterator[None]:
-    """Connect to a dask scheduler. The backend `dask` of joblib uses this client."""
+def _client(address: str) -> Iterator[Any]:
+    """Connect to a dask scheduler, and yield the client.
+
+    Args:
+        address: address of the scheduler.
+
+    Raises:
+        FanOutError: If dask is missing, or the scheduler does not respond.
+    """
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
@@ -185,5 +254,12 @@ def _client(address: str) -> Iterator[None]:
         raise FanOutError(
             f"no dask scheduler responds at {address} ({error}): start one with `dask scheduler`"
         ) from error
-    with client:
-        yield
+    # The error of a lost connection is reported as one sentence. The client would also log its traceback.
+    logger = logging.getLogger("distributed.client")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with client:
+            yield client
+    finally:
+        logger.setLevel(level)

@@ -12,6 +12,7 @@ from typing import Any
 
 import joblib
 import pytest
+from distributed import LocalCluster
 from joblib.externals.loky.process_executor import _ExecutorManagerThread
 
 from atalante_control.gait_optimization.parallel import FanOutError, LostProcessError, fan_out
@@ -126,6 +127,88 @@ def test_end_of_a_process_gives_one_sentence() -> None:
         LostProcessError, match=r"^a process ended unexpectedly.*; calls without a result: 3; repeat the command"
     ):
         list(fan_out(killed, range(3), jobs=2))
+
+
+_active = 0
+
+
+def active_calls(_: int) -> tuple[int, int]:
+    """Return the number of calls that are active in this process at the same time, and the process."""
+    global _active
+    _active += 1
+    time.sleep(0.2)
+    found, _active = _active, _active - 1
+    return found, os.getpid()
+
+
+@pytest.mark.filterwarnings("ignore")  # dask's own
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_worker_of_a_cluster_runs_one_call_at_a_time(threads: int) -> None:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=threads, host="127.0.0.1", dashboard_address=None, silence_logs=50
+    ) as cluster:
+        found = list(fan_out(active_calls, range(4), cluster=cluster.scheduler_address))
+    assert [active for active, _ in found] == [1] * 4
+    assert len({process for _, process in found} - {os.getpid()}) == 1
+
+
+@pytest.mark.filterwarnings("ignore")  # dask's own
+def test_cluster_without_workers_gives_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("atalante_control.gait_optimization.parallel._WORKER_TIMEOUT", 0.2)
+    with LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=None, silence_logs=50) as cluster:
+        address = cluster.scheduler_address
+        with pytest.raises(FanOutError, match=f"has no worker: start one with `dask worker {address}`$"):
+            list(fan_out(doubled, [1], cluster=address))
+
+
+def _missing() -> None:
+    raise AttributeError("this version has no such function")
+
+
+class Foreign:
+    """Task that can be pickled but not loaded, like a function that the scheduler does not have."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _missing, ()
+
+
+@pytest.mark.filterwarnings("ignore")  # dask's own
+def test_scheduler_that_cannot_load_the_calls_gives_one_sentence() -> None:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, silence_logs=50
+    ) as cluster:
+        with pytest.raises(FanOutError, match="must have the same versions of this project"):
+            list(fan_out(str, [Foreign()], cluster=cluster.scheduler_address))
+        with pytest.raises(RuntimeError, match="raised in a call"):
+            list(fan_out(fails, [1], cluster=cluster.scheduler_address))
+
+
+@pytest.mark.filterwarnings("ignore")  # dask's own
+def test_lost_scheduler_gives_one_sentence() -> None:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, silence_logs=50
+    ) as cluster:
+        results = fan_out(slow, [0.0, 600.0], cluster=cluster.scheduler_address)
+        next(results)
+        cluster.close()
+        with pytest.raises(FanOutError, match=r"is lost; repeat the command when it runs again$"):
+            next(results)
+
+
+def fails(_: int) -> None:
+    raise RuntimeError("raised in a call")
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore")  # dask's own
+def test_call_that_ends_every_worker_gives_one_sentence() -> None:
+    with (
+        LocalCluster(
+            n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, silence_logs=50
+        ) as cluster,
+        pytest.raises(LostProcessError, match=r"^a call ended several workers of .*; repeat the command$"),
+    ):
+        list(fan_out(killed, [1], cluster=cluster.scheduler_address))
 
 
 def test_missing_dependency_error_contains_the_command_to_type(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,6 @@ Tasks and results are kept small, because they are sent between processes or com
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -191,18 +190,13 @@ def plan(ids: Sequence[str], scope: Scope, engine: str = PYBULLET) -> list[Task]
     return tasks
 
 
-#: Lock for the threads of a dask worker. All runs of a process share one controller, so only one run may be active.
-_one_at_a_time = threading.Lock()
-
-
 def run_task(task: Task) -> Result:
     """Run a task. This function is called in a worker process.
 
     Args:
         task: task to run.
     """
-    with _one_at_a_time:
-        return task()
+    return task()
 
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
