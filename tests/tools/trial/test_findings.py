@@ -279,6 +279,14 @@ def test_protocol_needs_certified_guides_and_no_alarm() -> None:
     assert verdicts(protocol_findings([{**walks[2], "outcome": "fell"}]))["protocol-contained"] is False
 
 
+def test_walks_without_a_guide_say_nothing_about_containment() -> None:
+    walk = {**walk_result(75.0, False, 1.0, net=0.0, error=0.5), "diagnostics": {}}
+    contained = protocol_findings([walk])[0]
+    assert (contained.statistic, contained.passed) == ("1 of 1 walks ended standing; no walk inside a guide", None)
+    fallen = protocol_findings([walk, {**walk, "outcome": "fell"}])[0]
+    assert (fallen.statistic, fallen.passed) == ("1 of 2 walks ended standing; no walk inside a guide", False)
+
+
 def test_full_assistance_has_no_guide_to_certify() -> None:
     walks = [walk_result(75.0, False, 1.0, net=0.0, error=0.5)]
     walks[0]["diagnostics"] = {}

@@ -364,6 +364,26 @@ def test_damaged_result_is_computed_again(damaged: str, tmp_path: Path) -> None:
     assert stored(trial, tmp_path) is not None
 
 
+@pytest.mark.parametrize("edit", [{"metabolic_w_kg": None}, {"outcome": "stood"}, {"remark": "checked"}])
+def test_edited_result_is_reported_and_computed_again(
+    edit: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before, a missing or changed value ended the command with a traceback or was reported as a result."""
+    monkeypatch.setattr(plan, "QUICK_SWEEP", ())
+    arguments = ["trial", "sweep", "--quick", "--jobs", "2", "--out", str(tmp_path)]
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 0, done.output
+    assert "1 of 1 trials to run on 1 process\n" in done.stderr
+    (path,) = (tmp_path / "trials").glob("*.json")
+    text = path.read_text()
+    result = {**json.loads(text), **edit}
+    path.write_text(json.dumps({name: value for name, value in result.items() if value is not None}))
+    again = CliRunner().invoke(cli, arguments)
+    assert again.exit_code == 0, again.output
+    assert f"{path} is damaged or was edited: its trial is run again\n" in again.stderr
+    assert path.read_text() == text
+
+
 def test_protocol_has_a_trial_per_subject_condition_and_factor() -> None:
     trials = protocol_trials(replace(SETTING, literal=True), (0.5, 0.0))
     assert len({trial.name for trial in trials}) == len({trial.seed for trial in trials}) == len(trials) == 32

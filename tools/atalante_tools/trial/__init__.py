@@ -447,19 +447,23 @@ def _run_missing(trials: Sequence[Trial], running: Running) -> None:
         Stopped: If a signal arrived. The results so far are in the folder.
     """
     from atalante_tools.session.body import require_engine
-    from atalante_tools.trial.store import compute, stored
+    from atalante_tools.trial.store import compute, path_of, stored
 
     folder = running.out / "trials"
     missing = [trial for trial in trials if stored(trial, folder) is None]
     if not missing:
         return
+    for file in (path_of(trial, folder) for trial in missing):
+        if file.exists():
+            print_message(f"{file} is damaged or was edited: its trial is run again")
     if not running.dask:  # this computer runs the trials, so it needs the engine
         require_engine(running.engine)
-    where = f"the workers of {running.dask}" if running.dask else f"{running.jobs} processes"
+    jobs = min(running.jobs, len(missing))
+    where = f"the workers of {running.dask}" if running.dask else f"{jobs} process{'es' if jobs > 1 else ''}"
     print_message(f"{len(missing)} of {len(trials)} trials to run on {where}")
     progress, done = Progress(), 0
     try:
-        for _ in compute(missing, folder, jobs=min(running.jobs, len(missing)), cluster=running.dask):
+        for _ in compute(missing, folder, jobs=jobs, cluster=running.dask):
             done += 1
             check_stop()
             progress.bar(done, len(missing), "trials")

@@ -325,9 +325,11 @@ def _contained(id_: str, results: Sequence[Result]) -> Finding:
     if not results:
         return Finding(id_, claim, "no results", None)
     stood = sum(r["outcome"] == "stood" for r in results)
-    largest = max(ratios, default=0.0)
-    text = f"{stood} of {len(results)} walks ended standing; largest |e|/q_bound {largest:.2f}, limit 1"
-    return Finding(id_, claim, text, stood == len(results) and largest <= 1.0)
+    ended = f"{stood} of {len(results)} walks ended standing; "
+    if not ratios:  # all walks had full assistance, or ended before the guide was used
+        return Finding(id_, claim, ended + "no walk inside a guide", None if stood == len(results) else False)
+    text = f"{ended}largest |e|/q_bound {max(ratios):.2f}, limit 1"
+    return Finding(id_, claim, text, stood == len(results) and max(ratios) <= 1.0)
 
 
 def _paired(

@@ -5,6 +5,7 @@ trials -> stored results, missing trials -> processes or a dask cluster -> files
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Generator, Sequence
@@ -34,7 +35,7 @@ def stored(trial: Trial, folder: Path) -> Result | None:
     """Return the stored result of a trial; None if the trial must be run.
 
     The file name contains a hash of the parameters of the trial and of all software versions. So the trial must also be run again
-    after a change of a parameter or a version, and if the file is damaged or contains the result of another trial.
+    after a change of a parameter or a version, and if the file is damaged, was edited or contains the result of another trial.
 
     Args:
         trial: trial of the result.
@@ -49,7 +50,9 @@ def stored(trial: Trial, folder: Path) -> Result | None:
         return None
     expected = json.loads(json.dumps({"trial": fields(trial), "versions": versions()}))  # JSON makes lists of tuples
     valid = (
-        isinstance(result, dict) and "outcome" in result and {name: result.get(name) for name in expected} == expected
+        isinstance(result, dict)
+        and result.pop("sha256", None) == _digest(result)
+        and {name: result.get(name) for name in expected} == expected
     )
     return result if valid else None
 
@@ -91,11 +94,23 @@ def _run(trial: Trial) -> Result:
     return {"trial": fields(trial), "versions": versions(), **run_trial(trial)}
 
 
+def _digest(result: Result) -> str:
+    """Return the SHA-256 of a result as it is after it was read from its file.
+
+    Args:
+        result: result that JSON has read, without the key "sha256".
+    """
+    return hashlib.sha256(json.dumps(result, sort_keys=True).encode()).hexdigest()
+
+
 def _write(path: Path, result: Result) -> None:
-    """Write a result to a temporary file, and rename the file when it is complete and on the disk."""
+    """Write a result to a temporary file, and rename the file when it is complete and on the disk.
+
+    The key "sha256" is added, so that `stored` finds a changed or missing value of any key.
+    """
     part = path.with_suffix(f".{os.getpid()}.part")
     with part.open("w") as file:
-        json.dump(result, file)
+        json.dump({**result, "sha256": _digest(json.loads(json.dumps(result)))}, file)
         file.write("\n")
         file.flush()
         os.fsync(file.fileno())
