@@ -49,6 +49,22 @@ def test_continued_run_that_ends_without_an_answer_is_an_error() -> None:
     assert one.ask("answer") == "here"
 
 
+def test_continued_run_ends_when_nobody_waits_for_its_answer() -> None:
+    before = set(children())
+    one = branch()
+    if isinstance(one, Continuation):
+        time.sleep(600.0)
+        one.abandon()
+    assert isinstance(one, Branch)
+    (waiting,) = set(children()) - before
+    one._channel.send("request")
+    del one
+    deadline = time.monotonic() + 60.0
+    while os.waitpid(waiting, os.WNOHANG) == (0, 0):  # it first waits for the end of the continued run
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
 def test_waiting_process_ends_when_the_branch_is_dropped() -> None:
     before = set(children())
     _, found = counted(3, 2)

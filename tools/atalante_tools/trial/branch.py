@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import warnings
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -47,6 +48,9 @@ class Branch:
 class Continuation:
     """Copy of a run that continues from a branch, in a new process. The new process must end with `finish` or `abandon`.
 
+    The new process also ends when nobody waits for its answer, for example after Ctrl-C in the process that asked. Otherwise the
+    copy would walk on for seconds and keep the open files of the run, with the lock of the output folder.
+
     Attributes:
         request: how the run continues.
     """
@@ -54,6 +58,17 @@ class Continuation:
     def __init__(self, request: Any, channel: Connection) -> None:
         self.request = request
         self._channel = channel
+        self._answered = False
+        threading.Thread(target=self._end_without_listener, daemon=True).start()
+
+    def _end_without_listener(self) -> None:
+        """End this process when the other end of the pipe is closed.
+
+        Between a request and its answer, nothing is sent to this process. So the pipe becomes readable only when it is closed.
+        """
+        self._channel.poll(None)
+        if not self._answered:
+            os._exit(1)
 
     def finish(self, answer: Any) -> None:
         """Send the answer and end this process.
@@ -61,6 +76,7 @@ class Continuation:
         Args:
             answer: object that can be pickled.
         """
+        self._answered = True  # from now on, the next request makes the pipe readable
         self._channel.send(answer)
         os._exit(0)
 
