@@ -116,8 +116,8 @@ def test_empty_bus_passes_nothing_and_exits_with_1(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("atalante_emulator.emulator.Emulator.poll", lambda emulator: None)
     result = run("LEFT_SH")
     assert result.exit_code == 1
-    assert "LEFT_SH: 0 of 40 requirements passed; not passed: NODE-01, " in result.stderr
-    assert " ".join(result.stdout.split()).count("measured: no frame of LEFT_SH received; ") == 40
+    assert "LEFT_SH: 0 of 41 requirements passed; not passed: NODE-01, " in result.stderr
+    assert " ".join(result.stdout.split()).count("measured: no frame of LEFT_SH received; ") == 41
 
 
 # -- requirements in general -------------------------------------------------------------------------------------------

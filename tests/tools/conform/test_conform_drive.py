@@ -37,7 +37,7 @@ SK = 3  # index of its joint
 def test_emulated_drive_passes_every_requirement(node: str, make_setup: MakeSetup):
     results = make_setup(node).examine()
     assert not_passed(results) == {}
-    assert len(results) == 40
+    assert len(results) == 41
 
 
 def test_expected_transitions_cover_the_standard():
@@ -226,6 +226,23 @@ def never_trips(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     return make_setup(NODE, parameters=EmulatorParameters(drive=DriveParameters(trip_temperature=1000.0)))
 
 
+def _measures(signal: str, factor: float) -> Callable[[MakeSetup, Patch], NodeSetup]:
+    """Return a drive that multiplies a measured signal by `factor` before it encodes the signal."""
+
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
+        del monkeypatch
+        setup = make_setup(NODE)
+        index = setup.emulator.signals.index(setup.message("STATE").name, signal)
+
+        def scale(_cycle: int, values: np.ndarray) -> None:
+            values[index] *= factor
+
+        setup.emulator.before_send.append(scale)
+        return setup
+
+    return broken
+
+
 F, N = Verdict.FAILED, Verdict.NOT_TESTED
 
 BROKEN: dict[str, tuple[Callable[[MakeSetup, Patch], NodeSetup], dict[str, Verdict]]] = {
@@ -267,6 +284,10 @@ BROKEN: dict[str, tuple[Callable[[MakeSetup, Patch], NodeSetup], dict[str, Verdi
     "never trips": (never_trips, {"DRIVE-22": F, "DRIVE-23": N}),
     "follows late commands": (follows_late_commands, {"DRIVE-24": F}),
     "switches a fault off without reset": (_with_rule(_switches_a_fault_off), {"DRIVE-23": F}),
+    "negates the velocity": (_measures("Velocity", -1.0), {"DRIVE-25": F}),
+    "negates the position": (_measures("Position", -1.0), {"DRIVE-25": F}),
+    "measures the position at the joint": (_measures("Position", 0.01), {"DRIVE-25": F}),
+    "measures no velocity": (_measures("Velocity", 0.0), {"DRIVE-25": F}),
 }
 
 
@@ -356,3 +377,23 @@ def test_obeyed_invalid_controlword_does_not_pass_at_a_low_torque(
     receive_as(setup, message, message.data_id ^ 1, obeys)
     (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "DRIVE-11"])
     assert result.verdict is verdict, result.measured
+
+
+@pytest.mark.parametrize(
+    ("factor", "verdict"), [(0.9, Verdict.PASSED), (1.1, Verdict.PASSED), (0.7, Verdict.FAILED), (1.3, Verdict.FAILED)]
+)
+def test_velocity_must_be_the_change_of_the_position(
+    factor: float, verdict: Verdict, make_setup: MakeSetup, monkeypatch: Patch
+):
+    setup = _measures("Velocity", factor)(make_setup, monkeypatch)
+    chosen = [r for r in requirements_of(setup.tester) if r.id in ("DRIVE-07", "DRIVE-25")]
+    assert [r.verdict for r in examine(setup.tester, chosen)] == [Verdict.PASSED, verdict]
+
+
+def test_velocity_of_a_drive_that_does_not_move_is_not_tested(make_setup: MakeSetup, monkeypatch: Patch):
+    setup = _measures("Velocity", 0.0)(make_setup, monkeypatch)
+    index = setup.emulator.signals.index(setup.message("STATE").name, "Position")
+    setup.emulator.before_send.append(lambda _, values: values.__setitem__(index, 0.25))
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "DRIVE-25"])
+    assert result.verdict is Verdict.NOT_TESTED
+    assert "the motor must move by 0.01 rad" in result.measured

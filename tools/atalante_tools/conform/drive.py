@@ -1,10 +1,11 @@
-"""Requirements for a drive: CiA 402 state machine, torque, torque limit, and reaction to loss of commands or SYNC."""
+"""Requirements for a drive: CiA 402 state machine, torque, torque limit, loss of commands or SYNC, and measured motion."""
 
 from __future__ import annotations
 
 from typing import Final
 
 from atalante_tools.conform import drive_commands as commands
+from atalante_tools.conform import drive_motion as motion
 from atalante_tools.conform import drive_states as states
 from atalante_tools.conform import drive_torque as torques
 from atalante_tools.conform.axis import FOLLOW, LEGAL, ROUTES, STAY
@@ -188,5 +189,12 @@ def requirements(tester: NodeTester) -> list[Requirement]:
             f"three times {TOLERATED} cycles without command, then commands with the counter that follows the last command",
             "fault matrix F25",
             commands.latches_late_commands,
+        ),
+        Requirement(
+            "DRIVE-25",
+            f"Reports a velocity that is the change of its position (within {motion.RATIO * 100:g} %).",
+            f"all state frames received so far, in windows of {motion.WINDOW} ms",
+            "DBC Position, Velocity",
+            motion.reports_consistent_motion,
         ),
     ]

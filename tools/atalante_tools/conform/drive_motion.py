@@ -1,0 +1,58 @@
+"""Test of the measured motion of a drive: the velocity must be the change of the position."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from atalante_hal.types import PERIOD
+from atalante_tools.conform.node_tester import NodeTester, NotTested
+from atalante_tools.conform.requirement import Outcome
+
+#: The position change is compared with the integral of the velocity over windows of this number of cycles.
+WINDOW: Final = 50
+#: The ratio of integral and position change may differ from 1 by at most this number. A filter of the velocity has a small
+#: effect on the ratio, because it delays the integral and does not scale it.
+RATIO: Final = 0.2
+#: A motion is compared only if its root mean square over all windows is at least this angle at the motor [rad]. The rounding
+#: of the velocity to its DBC step changes the integral over a window by at most a twentieth of this angle.
+MOTION: Final = 0.01
+
+
+def reports_consistent_motion(tester: NodeTester) -> Outcome:
+    """Test DRIVE-25: the integral of the velocity equals the change of the position, in all state frames received.
+
+    The test needs no motion of its own, because the joint moves in the other tests.
+    """
+    if not tester.states(tester.received):
+        tester.idle(4 * WINDOW)
+    received = tester.states(tester.received)
+    cycles = np.array([frame.cycle for frame in received], dtype=np.int64)
+    position = np.array([frame.values["Position"] for frame in received])
+    velocity = np.array([frame.values["Velocity"] for frame in received])
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(cycles) * PERIOD
+    integral = np.concatenate([[0.0], np.cumsum(steps)])
+    signal = tester.state_message.signal("Velocity")
+    # A drive sends a velocity outside the DBC range as the end of the range.
+    clipped = (velocity <= signal.minimum) | (velocity >= signal.maximum)
+    count = np.cumsum(clipped)
+    complete = cycles[WINDOW:] - cycles[:-WINDOW] == WINDOW  # windows without a lost frame
+    complete &= count[WINDOW:] == (count - clipped)[:-WINDOW]
+    change = (position[WINDOW:] - position[:-WINDOW])[complete]
+    expected = (integral[WINDOW:] - integral[:-WINDOW])[complete]
+    if not len(change):
+        raise NotTested(
+            f"{WINDOW} consecutive state frames of the DBC length must be received; see NODE-04 and NODE-13"
+        )
+    moved, integrated = math.sqrt(np.mean(change**2)), math.sqrt(np.mean(expected**2))
+    text = (
+        f"in {WINDOW} ms the position changes by {moved:.3f} rad, the integral of the velocity by {integrated:.3f} rad"
+    )
+    if max(moved, integrated) < MOTION:
+        raise NotTested(f"the motor must move by {MOTION:g} rad; {text}; turn the joint by hand during the examination")
+    if moved < MOTION * RATIO:
+        return Outcome(False, text)
+    ratio = float(change @ expected / (change @ change))
+    return Outcome(abs(ratio - 1.0) <= RATIO, f"{text}, ratio {ratio:+.2f}")
