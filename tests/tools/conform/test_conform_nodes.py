@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 from collections import deque
 from collections.abc import Callable
 
@@ -438,6 +439,69 @@ def test_defective_node_fails_only_its_requirement(name: str, make_setup: MakeSe
     setup = broken(make_setup, monkeypatch)
     without = () if expected.startswith("NODE") else _REST
     assert not_passed(setup.examine(without)) == {expected: Verdict.FAILED}
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize(("vector", "axes", "wrong"), [("Quaternion", "WXYZ", "IMU-01"), ("Accel", "XYZ", "IMU-02")])
+def test_attitude_of_a_zero_vector_does_not_pass(
+    vector: str, axes: str, wrong: str, make_setup: MakeSetup, monkeypatch: Patch
+):
+    def clear(at: Callable[[str], int], _cycle: int, values: np.ndarray) -> None:
+        for axis in axes:
+            values[at(f"{vector}{axis}")] = 0.0
+
+    setup = _measures(clear)(make_setup, monkeypatch)
+    chosen = [r for r in requirements_of(setup.tester) if r.id in (wrong, "IMU-03")]
+    results = {r.requirement.id: r for r in examine(setup.tester, chosen)}
+    assert (results[wrong].verdict, results["IMU-03"].verdict) == (Verdict.FAILED, Verdict.NOT_TESTED)
+    assert "must not be 0" in results["IMU-03"].measured
+
+
+@pytest.mark.parametrize(
+    ("requirement", "change", "expected"),
+    [
+        ("NODE-12", {"data": 1}, r"_STATE in cycle 1 \(0x[0-9a-f]{4}, expected 0x[0-9a-f]{4}\), "),
+        ("NODE-13", {"len": 24}, r"_STATE in cycle 1 \(24 bytes, expected 32\), "),
+        ("NODE-13", {"len": 8, "flags": 0}, r"_STATE in cycle 1 \(8 bytes, expected 32; classic CAN\), "),
+        ("NODE-13", {"flags": FLAG_FDF}, r"_STATE in cycle 1 \(CAN FD without bit rate switch\), "),
+        ("NODE-11", {"len": 2}, r"_STATE without counter in cycle 1, expected 1, "),
+        ("NODE-12", {"len": 1}, r"_STATE in cycle 1 \(no CRC\), "),
+    ],
+)
+def test_wrong_frame_is_named_with_its_values(
+    requirement: str, change: dict[str, int], expected: str, make_setup: MakeSetup, monkeypatch: Patch
+):
+    def wrong(frame: Frames, _message: Message, _number: int) -> Frames:
+        for field, value in change.items():
+            if field == "data":
+                frame["data"][0, 0] ^= value
+            else:
+                frame[field] = value
+        return frame
+
+    setup = _sends("STATE", wrong)(make_setup, monkeypatch)
+    setup.tester.idle(5)
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == requirement])
+    assert result.verdict is Verdict.FAILED
+    assert re.search(expected, result.measured), result.measured
+
+
+def test_value_out_of_range_is_named_with_the_range(make_setup: MakeSetup, monkeypatch: Patch):
+    def wrong(frame: Frames, message: Message, _number: int) -> Frames:
+        frame["data"][0, message.signal("ImuState").start // 8] = 3
+        return wire.protect(frame, message)
+
+    setup = _sends("STATE", wrong)(make_setup, monkeypatch)
+    setup.tester.idle(5)
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "NODE-14"])
+    assert result.verdict is Verdict.FAILED
+    assert f"{IMU}_STATE.ImuState in cycle 1 (3, range 0 to 2), " in result.measured
+
+
+def test_emergency_is_named_with_its_code(make_setup: MakeSetup, monkeypatch: Patch):
+    setup = raises_an_emergency(make_setup, monkeypatch)
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "NODE-05"])
+    assert result.measured == "1 emergencies: 0x5000"
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

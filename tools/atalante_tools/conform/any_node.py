@@ -134,38 +134,21 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
             "Protects every frame with a CRC over payload and Data ID.",
             all_frames,
             e2e,
-            _all(
-                lambda received: [
-                    f"{frame.message.name} in cycle {frame.cycle}" for frame in received if not frame.crc_valid
-                ]
-            ),
+            _all(_crc_defects),
         ),
         Requirement(
             "NODE-13",
             "Sends CAN FD data frames with 11-bit identifier, bit rate switch and the length given in the DBC.",
             all_frames,
             "DBC length, VFrameFormat",
-            _all(
-                lambda received: [
-                    f"{frame.message.name} in cycle {frame.cycle}"
-                    for frame in received
-                    if not (frame.length_valid and frame.format_valid)
-                ],
-                with_unexpected=True,
-            ),
+            _all(_format_defects, with_unexpected=True),
         ),
         Requirement(
             "NODE-14",
             "Sends every signal within its range and never with its invalid code.",
             all_frames,
             "DBC ranges, InvalidRaw",
-            _all(
-                lambda received: [
-                    f"{frame.message.name}.{name} in cycle {frame.cycle}"
-                    for frame in received
-                    for name in frame.out_of_range
-                ]
-            ),
+            _all(_range_defects),
         ),
         Requirement(
             "NODE-15",
@@ -208,7 +191,7 @@ def boots_up(tester: NodeTester) -> Outcome:
     tester.unexpected.clear()
     if not tester.run_until(lambda _: len(_statuses(tester)) >= 2):
         return Outcome(False, f"{len(_statuses(tester))} heartbeats within {tester.technician.patience:g} s")
-    reported = [NMT.get(int(frame.values["NodeState"]), "unknown NMT state") for frame in _statuses(tester)]
+    reported = [_nmt_state(frame) for frame in _statuses(tester)]
     return Outcome(reported == ["BOOTUP", "OPERATIONAL"], ", then ".join(reported))
 
 
@@ -247,7 +230,11 @@ def raises_no_emergency(tester: NodeTester) -> Outcome:
     if not tester.received:
         tester.idle(_ANSWER_CYCLES)
     raised = [frame for frame in tester.received if frame.message is tester.emergency_message]
-    return Outcome(not raised, f"{len(raised)} emergencies" if raised else "no emergency")
+    codes = ", ".join(
+        f"{int(frame.values['ErrorCode']):#06x}" if frame.values else "wrong length" for frame in raised[:_LISTED]
+    )
+    more = ", ..." * (len(raised) > _LISTED)
+    return Outcome(not raised, f"{len(raised)} emergencies: {codes}{more}" if raised else "no emergency")
 
 
 # -- SYNC and foreign frames -------------------------------------------------------------------------------------------
@@ -260,7 +247,7 @@ def is_silent_without_sync(tester: NodeTester) -> Outcome:
     text = f"{len(received)} state frames in 10 ms without SYNC"
     answers = tester.states(tester.idle(2))
     if not (received or answers):
-        raise NotTested(f"{text}, and no answer to SYNC; see NODE-04")
+        raise NotTested(f"{text}, and no answer of the DBC length to SYNC; see NODE-04 and NODE-13")
     return Outcome(not received, text)
 
 
@@ -336,9 +323,7 @@ def _all(
 
 def stays_operational(tester: NodeTester) -> Outcome:
     """Test NODE-16: all heartbeats after the boot-up report OPERATIONAL."""
-    states = [
-        (NMT.get(int(frame.values["NodeState"]), "unknown NMT state"), frame.cycle) for frame in _statuses(tester)
-    ]
+    states = [(_nmt_state(frame), frame.cycle) for frame in _statuses(tester)]
     after_boot = list(dropwhile(lambda state: state[0] == "BOOTUP", states))
     if not after_boot:
         raise NotTested("no heartbeat was received after the boot-up message")
@@ -355,15 +340,53 @@ def _counter_defects(received: list[ReceivedFrame]) -> list[str]:
         if frame.message.cycle_ms != 1:
             by_message.setdefault(frame.message.name, []).append(frame)
     return [
-        f"{frame.message.name} {frame.counter} in cycle {frame.cycle}, expected {frame.cycle & 0xFF}"
+        f"{frame.message.name} {_counter_text(frame)} in cycle {frame.cycle}, expected {frame.cycle & 0xFF}"
         for frame in received
         if frame.message.cycle_ms == 1 and frame.counter != frame.cycle & 0xFF
     ] + [
-        f"{name} {after.counter} after {before.counter} in cycle {after.cycle}"
+        f"{name} {_counter_text(after)} after {_counter_text(before)} in cycle {after.cycle}"
         for name, frames in by_message.items()
         for before, after in pairwise(frames)
         if (after.counter - before.counter) & 0xFF != 1
     ]
+
+
+def _counter_text(frame: ReceivedFrame) -> str:
+    return str(frame.counter) if frame.counter >= 0 else "without counter"
+
+
+def _nmt_state(status: ReceivedFrame) -> str:
+    state = int(status.values["NodeState"])
+    return NMT.get(state, f"unknown NMT state {state}")
+
+
+def _crc_defects(received: list[ReceivedFrame]) -> list[str]:
+    return [
+        f"{frame.message.name} in cycle {frame.cycle} ("
+        + (f"{frame.crc:#06x}, expected {frame.crc_expected:#06x})" if frame.crc >= 0 else "no CRC)")
+        for frame in received
+        if not frame.crc_valid
+    ]
+
+
+def _format_defects(received: list[ReceivedFrame]) -> list[str]:
+    defects = []
+    for frame in received:
+        wrong = [] if frame.length_valid else [f"{frame.length} bytes, expected {frame.message.length}"]
+        wrong += [] if frame.format_valid else [frame.format]
+        if wrong:
+            defects.append(f"{frame.message.name} in cycle {frame.cycle} ({'; '.join(wrong)})")
+    return defects
+
+
+def _range_defects(received: list[ReceivedFrame]) -> list[str]:
+    defects = []
+    for frame in received:
+        for name in frame.out_of_range:
+            signal = frame.message.signal(name)
+            text = f"{frame.values[name]:g}, range {signal.minimum:g} to {signal.maximum:g}"
+            defects.append(f"{frame.message.name}.{name} in cycle {frame.cycle} ({text})")
+    return defects
 
 
 def _statuses(tester: NodeTester, received: list[ReceivedFrame] | None = None) -> list[ReceivedFrame]:

@@ -14,6 +14,8 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames
 
 _FD: Final = FLAG_FDF | FLAG_BRS
+#: Format of a valid frame, as in `ReceivedFrame.format`.
+FD_FORMAT: Final = "CAN FD with bit rate switch"
 
 
 class MessageSender:
@@ -96,13 +98,29 @@ class ReceivedFrame:
     message: Message
     cycle: int  # number of the cycle in which the frame was received
     time: float  # receive time [s]
-    length_valid: bool
-    format_valid: bool  # whether the frame is a CAN FD frame with bit rate switch
-    crc_valid: bool
-    counter: int
+    length: int  # payload length [byte]
+    format: str  # "CAN FD with bit rate switch", "CAN FD without bit rate switch" or "classic CAN"
+    crc: int  # CRC in the frame, -1 if the frame is too short
+    crc_expected: int  # CRC over payload and Data ID
+    counter: int  # alive counter, -1 if the frame is too short
     reserved_zero: bool
     out_of_range: tuple[str, ...]  # signals with a value out of range or with the invalid code
     values: dict[str, float]  # physical values in DBC units; empty if the length is wrong
+
+    @property
+    def length_valid(self) -> bool:
+        """Return whether the payload has the length in the DBC."""
+        return self.length == self.message.length
+
+    @property
+    def format_valid(self) -> bool:
+        """Return whether the frame is a CAN FD frame with bit rate switch."""
+        return self.format == FD_FORMAT
+
+    @property
+    def crc_valid(self) -> bool:
+        """Return whether the CRC matches payload and Data ID."""
+        return self.crc == self.crc_expected
 
 
 class MessageReceiver:
@@ -141,14 +159,16 @@ class MessageReceiver:
             values = dict(zip(self._names, self._decoded.tolist(), strict=True))
             if not inside:
                 out_of_range = tuple(s.name for s in message.signals if not self._is_inside(s.name, values[s.name]))
-        reported = int(payload[0]) | int(payload[1]) << 8 if length >= CRC_BYTES else -1
+        flags = int(frame["flags"][0])
+        classic = "CAN FD without bit rate switch" if flags & FLAG_FDF else "classic CAN"
         return ReceivedFrame(
             message=message,
             cycle=cycle,
             time=time,
-            length_valid=length_valid,
-            format_valid=int(frame["flags"][0]) & _FD == _FD,
-            crc_valid=crc(payload[CRC_BYTES:].tobytes(), self._data_id) == reported,
+            length=length,
+            format=FD_FORMAT if flags & _FD == _FD else classic,
+            crc=int(payload[0]) | int(payload[1]) << 8 if length >= CRC_BYTES else -1,
+            crc_expected=crc(payload[CRC_BYTES:].tobytes(), self._data_id),
             counter=int(payload[COUNTER_BYTE]) if length > COUNTER_BYTE else -1,
             reserved_zero=not length_valid or not (payload & self._reserved).any(),
             out_of_range=out_of_range,

@@ -262,5 +262,5 @@ def _amplitudes(tester: NodeTester, received: list[ReceivedFrame]) -> Vector:
     """Return the amplitude of each motor in each state frame. Shape (states, motors)."""
     states = tester.states(received)
     if not states:
-        raise NotTested("no state frame received")
+        raise NotTested("no state frame of the DBC length received; see NODE-04 and NODE-13")
     return np.array([[frame.values[f"{motor}_Amplitude"] for motor in _motors(tester)] for frame in states])

@@ -63,7 +63,7 @@ def sends_no_request(tester: NodeTester) -> Outcome:
     """Test PENDANT-01: the request counter of the pendant does not change without a button press."""
     received = tester.states(tester.idle(200))
     if not received:
-        raise NotTested("no state frame received")
+        raise NotTested("no state frame of the DBC length received; see NODE-04 and NODE-13")
     counters = {int(frame.values["RequestCounter"]) for frame in received}
     return Outcome(len(counters) == 1, f"{len(counters) - 1} requests in {len(received)} frames")
 
@@ -118,5 +118,5 @@ def _reports_press(action: Action, request: int) -> Callable[[NodeTester], Outco
 def _last(tester: NodeTester, received: list[ReceivedFrame]) -> dict[str, float]:
     states = tester.states(received)
     if not states:
-        raise NotTested("no state frame received")
+        raise NotTested("no state frame of the DBC length received; see NODE-04 and NODE-13")
     return states[-1].values

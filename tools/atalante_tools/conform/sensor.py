@@ -113,6 +113,8 @@ def agrees_with_gravity(tester: NodeTester) -> Outcome:
     """Test IMU-03: accelerometer and quaternion give the same upward direction."""
     _, quaternions, acceleration = _attitudes(tester, "Accel")
     mean, force = quaternions.mean(axis=0), acceleration.mean(axis=0)
+    if not (mean.any() and force.any()):  # a zero vector has no direction
+        raise NotTested("the mean quaternion and the mean acceleration must not be 0; see IMU-01 and IMU-02")
     w, x, y, z = mean / np.linalg.norm(mean)
     # `up` is the world z axis in the sensor frame.
     up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
@@ -199,7 +201,7 @@ def _signals(tester: NodeTester, names: Sequence[str]) -> Vector:
 def _frames(tester: NodeTester) -> list[ReceivedFrame]:
     received = tester.states(tester.idle(_MEASURED))
     if not received:
-        raise NotTested("no state frame received")
+        raise NotTested("no state frame of the DBC length received; see NODE-04 and NODE-13")
     return received
 
 
