@@ -1,6 +1,6 @@
 """CAN transports: classes that send and receive the CAN frames of the HAL or the emulator.
 
-Several transports implement the interface `Bus`. The HAL and the emulator run on each transport without change:
+Several transports implement the interface `Bus`. The HAL and the emulator run on each transport without change, except on a log:
 
 - `socketcan.SocketCanBus`: a Linux CAN interface, such as `can0` of an adapter or `vcan0`;
 - `pair.PairBus`: two ends in one process, in lock-step;

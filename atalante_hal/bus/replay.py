@@ -1,4 +1,7 @@
-"""Bus that replays a recorded log, for the HAL, the validator or the viewer.
+"""Bus that replays a recorded log, for programs that only receive.
+
+A HAL cannot repeat its decisions on this bus: nothing can be sent, and the answers in the log have the cycle numbers of the
+recorded SYNCs. A HAL on this bus reports `BUS_DOWN` and stays OFF.
 
 The frames are returned in the order and with the time stamps of the log. If `cycle_id` is given, each call of
 `receive()` returns the frames of one cycle. `cycle_id` is the identifier of the first frame of a cycle (SYNC).
