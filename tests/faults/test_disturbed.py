@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,6 +67,21 @@ def test_disturbed_controller_requests_the_faulty_torque(fault: HostFault, torqu
     assert np.array_equal(controller.update(StateAtCycle(BEGINS)).torque, torque, equal_nan=True)
     assert controller.telemetry is ConstantController.telemetry
     assert controller.telemetry_fields == ConstantController.telemetry_fields
+
+
+@pytest.mark.parametrize(
+    "fault", [HostFault("request", value=9.0), HostFault("shake", value=9.0), HostFault("full_torque", value="left_SK")]
+)
+def test_wrong_torque_changes_no_other_field_of_the_command(fault: HostFault) -> None:
+    """Without `walking` and `step`, the HAL would enter HOLD in a step. Without `outside`, it would report no GUIDE_OUTSIDE."""
+    command = Command(np.ones(12), np.full(8, 0.5), 3, True, True, True, True)
+    inner = ConstantController()
+    inner.update = lambda state: command
+    controller = DisturbedController(inner, at(HostFaults([fault], BEGINS), BEGINS))
+    sent = controller.update(StateAtCycle(BEGINS))
+    assert not np.array_equal(sent.torque, np.ones(12))
+    assert replace(sent, torque=command.torque) == command
+    assert np.array_equal(command.torque, np.ones(12))
 
 
 def test_disturbed_controller_raises_in_reset_or_update() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -127,7 +128,10 @@ class DisturbedController:
         self._raise(self._now.of("raise_in_reset"))
 
     def update(self, state: State) -> Command:
-        """Return the command of the wrapped controller. During a fault, return a wrong command or raise an exception.
+        """Return the command of the wrapped controller. During a fault, return wrong torques or raise an exception.
+
+        Only the torques are wrong. The other fields are those of the wrapped controller, because they tell the HAL whether the
+        robot walks, in which step, and whether a joint is outside its guide.
 
         Args:
             state: state of the HAL.
@@ -138,15 +142,15 @@ class DisturbedController:
         if wrong is None:
             return command
         if wrong.kind == "shake":
-            return Command(command.torque + _HIP * float(wrong.value) * (-1.0) ** state.cycle, command.vibration)
+            return replace(command, torque=command.torque + _HIP * float(wrong.value) * (-1.0) ** state.cycle)
         if wrong.kind == "full_torque":
             joint = str(wrong.value).lstrip("-")
             torque = command.torque.copy()
             torque[JOINTS.index(joint)] = -_TOO_MUCH if str(wrong.value).startswith("-") else _TOO_MUCH
-            return Command(torque, command.vibration)
+            return replace(command, torque=torque)
         if wrong.kind == "shape":
-            return Command(np.zeros(int(wrong.value)), command.vibration)
-        return Command(np.full(len(JOINTS), float(wrong.value)), command.vibration)
+            return replace(command, torque=np.zeros(int(wrong.value)))
+        return replace(command, torque=np.full(len(JOINTS), float(wrong.value)))
 
     @staticmethod
     def _raise(fault: HostFault | None) -> None:
