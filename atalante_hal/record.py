@@ -34,6 +34,7 @@ class Record:
 
     def __init__(self, codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> None:
         self.layout = Layout(_fields(codec, controller_fields))
+        self._joint_rows = tuple(codec.rows[f"{joint.upper()}_STATE"] for joint in JOINTS)
         self._imu_rows = tuple(codec.rows[f"IMU_{imu.upper()}_STATE"] for imu in IMUS)
         self._foot_rows = tuple(codec.rows[f"FOOT_{foot.upper()}_STATE"] for foot in FEET)
         self.values = np.zeros(self.layout.size)
@@ -81,6 +82,7 @@ class Record:
             valid=np.zeros(messages, np.bool_),
             age=np.zeros(messages, np.int64),
             joints_valid=False,
+            joint_rows=self._joint_rows,
             imu_rows=self._imu_rows,
             foot_rows=self._foot_rows,
         )

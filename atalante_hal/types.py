@@ -65,6 +65,7 @@ class State:
     #: The state, temperature and torque of a drive may be newer than the last accepted motion of its joint.
     age: npt.NDArray[np.int64]
     joints_valid: bool  # True if all twelve joint states are valid
+    joint_rows: tuple[int, ...] = ()  # indices of the messages of the drives in `valid` and `age`; empty if unknown
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
     #: Indices in `robot.IMUS` of the IMUs whose readings contradict gravity or their own attitude (`IMU_IMPLAUSIBLE`).
@@ -99,6 +100,9 @@ class Command:
     #: The deviations at the start of the step are those of angle, speed and acceleration, and the torque jump.
     #: If `hand_over_exceeded` is True, the HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not react to it.
     hand_over_exceeded: bool = False
+    #: True in the cycle in which a step starts without a guide, or its guide ends early, because the delay of the loop is longer
+    #: than guides cover. The HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not react to it.
+    late: bool = False
 
 
 class Controller(Protocol):

@@ -42,6 +42,7 @@ from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.certificate import Certificate
 from atalante_control.guide.filter import GuideFilter
 from atalante_control.guide.literal import LiteralConfig, LiteralGuide, no_promise
+from atalante_control.guide.loop_delay import LoopDelay
 from atalante_control.guide.outside_count import OutsideCount
 from atalante_control.guide.shapes import GuideShape
 from atalante_control.guide.step_guides import Choice, StepGuides
@@ -115,7 +116,7 @@ class AirwalkController:
         inertia = AssistedInertia(articulated, poses)
         leg = swing_leg(config, gait, inertia, self._gravity)
         self._guides = StepGuides(config, robot, shape, leg, self._carry.guided_blend, OVERLAP)
-        self.guide = self._guides.filters[-1]
+        self.guide, self._loop_delay = self._guides.filters[-1], LoopDelay()
         of_gait = gait if gait.feedforward is not None else suspended_gait(gait, exoskeleton, robot)
         self._literal = LiteralGuide(
             LiteralConfig(config.gains.swing, config.promise, config.zeta, config.idealization, config.feedforward),
@@ -218,6 +219,7 @@ class AirwalkController:
             state: measured state of the robot.
         """
         self._forget()
+        self._loop_delay.reset(state)
         self._changed_at = state.cycle
         self._start_motion.start(state.position)
         self._carry.start(state.torque)
@@ -233,7 +235,7 @@ class AirwalkController:
         self._share.fill(1.0)
         self.pid.start_step(RIGHT, self._share)
         self._command.vibration.fill(0.0)
-        self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
+        self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = self._command.late = False
         self._outside = OutsideCount(self.config.outside_cycles)
         self._promised = False
         #: Angle deviations [rad] and speed deviations [rad/s] of hip and knee at the start of the step.
@@ -254,6 +256,7 @@ class AirwalkController:
             The command, overwritten by the next call.
         """
         cycle = state.cycle - self._changed_at
+        self._command.late = False
         if self._walking:
             if step_over(cycle, self._cycles):
                 if self._stance == RIGHT:
@@ -302,6 +305,9 @@ class AirwalkController:
         self._changed_at, self._stance = state.cycle, stance
         self._command.step = (self._command.step or 0) + 1
         xi = min(1.0, max(0.0, state.assistance_factor))
+        if xi < 1.0 and not self._loop_delay.is_covered(state):
+            self._command.late, xi = True, 1.0
+            self.statistics.late += 1
         self._assisting = xi < 1.0
         self.statistics.factors.add(xi)
         leg = _LEG * (1 - stance)

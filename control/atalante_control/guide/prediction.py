@@ -21,6 +21,8 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
+#: Smallest and largest number of cycles between a measurement and the torque that is computed from it.
+DELAYS = (1, 2)
 #: Torques and speeds are predicted only for these numbers of cycles ahead. Tracking errors are predicted for every cycle.
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
 #: Typical magnitude of each of the 10 elements of the leg state (errors, rates and accelerations, see `backup_policy.STATES`).
@@ -40,8 +42,7 @@ class Assumptions:
     loop: SampledLoop = field(default_factory=SampledLoop)  # lag of the motor torque, and lag of the measured velocity
     mismatch: Mismatch = field(default_factory=Mismatch)  # largest errors of friction and inertia
     hand_over: HandOver = field(default_factory=HandOver)  # largest deviations when a step starts
-    #: Smallest and largest number of cycles between a measurement and the torque that is computed from it.
-    delays: tuple[int, int] = (1, 2)
+    delays: tuple[int, int] = DELAYS  # cycles
     rate: float = 20.0  # Nm, largest change of the command within one cycle that the limiter of the robot permits
     horizon: int = 300  # number of predicted cycles
     overlap: int = 100  # number of cycles of the next step in the tables; predictions can end in the next step

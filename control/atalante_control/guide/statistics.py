@@ -20,6 +20,7 @@ class GuideStatistics:
     hand_overs: int = 0  # number of steps whose start was compared with the hand-over box
     #: Number of compared steps that start outside the hand-over box (`HandOver`). The certificate does not apply to them.
     hand_overs_exceeded: int = 0
+    late: int = 0  # number of steps whose guide did not act, or not to the end, because of the delay of the loop
     factors: set[float] = field(default_factory=set)  # assistance factors of all steps so far
 
     @property

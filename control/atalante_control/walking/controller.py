@@ -21,6 +21,7 @@ import numpy as np
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.certificate import Certificate
+from atalante_control.guide.loop_delay import LoopDelay
 from atalante_control.guide.outside_count import OutsideCount
 from atalante_control.guide.shapes import PINCHED, GuideShape
 from atalante_control.joint.flat_foot import ankle_records, flat_feet
@@ -132,6 +133,7 @@ class WalkController:
         self._section = self._sections[0]
 
         pid, self._observer = Pid(config.gains), AttitudeObserver(config.observer_bandwidth)
+        self._loop_delay = LoopDelay()
         self._imus = {_PELVIS: np.array(exoskeleton.pelvis_imu), _TORSO: np.array(exoskeleton.torso_imu)}
         weight = kinematics.mass * GRAVITY
         self._constants = Constants(
@@ -252,7 +254,7 @@ class WalkController:
         self._stage.assisted = self._stage.literal = self._stage.placed = False
         self._command.step, self._command.walking = None, False
         self._command.vibration.fill(0.0)
-        self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
+        self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = self._command.late = False
         self._load[:] = self._twist[:] = 0.0
         self.steering.reset()
         self._pid.reset()
@@ -338,6 +340,7 @@ class WalkController:
             StanceError: If the robot is on the ground with one foot ahead of the other, for example after HOLD in a step.
         """
         self._forget(state.cycle)
+        self._loop_delay.reset(state)
         self._constants.gains[:] = self.config.leg_gains(state.delay)
         self._observer.reset(state.imu_quaternion[_PELVIS].tolist())
         self._bind(state)
@@ -372,10 +375,14 @@ class WalkController:
             self.stop()
         cycle = state.cycle - self._since
         following = next_phase(self.phase, self._facts(cycle))
+        self._command.late = False
         if following is not None:
-            self._begin(following, state.cycle, state.assistance_factor)
+            self._begin(following, state)
             cycle = 0
             self._torque_before[:] = self._measured.sent
+        elif self._assisted and cycle <= self._stage.last_guided and self._loop_delay.stays_uncovered(state):
+            self._command.late, self._stage.last_guided = True, cycle - 1
+            self.statistics.guide.late += 1
         self._act(
             cycle, self._measured, self._table, self._constants, self._stabiliser, self._section.assistance, self._parts
         )
@@ -522,7 +529,7 @@ class WalkController:
         stopping = self._stopping or self.steps_begun >= self.steps_wanted
         return Facts(elapsed, nominal, self._rest, self._timeout, landed, loaded, stopping)
 
-    def _begin(self, phase: Phase, cycle: int, xi: float) -> None:
+    def _begin(self, phase: Phase, state: State) -> None:
         """Start a phase: set stance leg and steering, start the re-centring from the measured motion, and start the guide."""
         before, stage, record = self.phase, self._stage, self._record
         swing = 1 - self._stance
@@ -550,13 +557,17 @@ class WalkController:
         steps = self.statistics.steps
         if phase is Phase.STEP and steps == self._section.end:
             self._section = self._sections[self._sections.index(self._section) + 1]
-        self.phase, self._since, self._table = phase, cycle, self._section.tables[phase, self._stance]
+        self.phase, self._since, self._table = phase, state.cycle, self._section.tables[phase, self._stance]
         stage.literal = self.config.literal_law and phase is Phase.STEP
         self._pid.limit_integral(math.inf if stage.literal else self.config.gains.integral_limit)
-        self._assisted = stage.assisted = phase is Phase.STEP and xi < 1.0 and steps >= self._section.guided
+        guided = phase is Phase.STEP and state.assistance_factor < 1.0 and steps >= self._section.guided
+        self._command.late = guided and not self._loop_delay.is_covered(state)
+        self.statistics.guide.late += self._command.late
+        self._assisted = stage.assisted = guided and not self._command.late
+        stage.last_guided = len(self._section.assistance.unmodelled) - 1
         stage.placed = phase in (Phase.START, Phase.STEP) and not self._assisted and not stage.literal
         self._start(self._measured, self._table, self._parts)
-        self._start_guide(min(1.0, max(0.0, xi)))
+        self._start_guide(min(1.0, max(0.0, state.assistance_factor)))
         record.feet[:], record.yaw = self.steering.feet.reshape(-1), self.steering.yaw
         record.phase, record.step, record.stance = phase, self.statistics.steps, self._stance
 
@@ -587,7 +598,7 @@ class WalkController:
             cycle: cycles since the start of the step.
         """
         command, guide = self._command, self.config.guide
-        guided = self._assisted and cycle < len(self._section.assistance.unmodelled)
+        guided = self._assisted and cycle <= self._stage.last_guided
         command.hand_over_exceeded = guided and cycle == 0 and self._check_hand_over()
         command.outside = False
         if guided:

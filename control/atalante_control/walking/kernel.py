@@ -84,6 +84,8 @@ class Stage:
     #: True: the virtual guide drives sagittal hip and knee of the swing leg, so the patient can move them within bounds.
     #: False: the baseline controller (PID) drives all joints, for example at assistance factor 1 or in the start step.
     assisted: bool
+    #: Last cycle of the step in which the guide acts: the nominal end of the step, or earlier if the loop is too slow.
+    last_guided: int
     intensity: float  # factor from 0 (off) to 1 on the levels of the vibration motors
     #: Nm, torque of the virtual guide minus torque of the baseline controller, in the last cycle with the guide.
     #: Elements: sagittal hip and knee of the swing leg.
@@ -126,7 +128,7 @@ class Assistance(NamedTuple):
     #: (n + 1, 2) Nm, torques of hip and knee that carry the patient's leg and compensate the pelvis motion. Row: cycle.
     #: `_assist` adds these torques to the gravity torques of the exoskeleton, unless `Stage.literal` is True.
     unmodelled: Vector
-    #: (m,) weights from 1 to 0 that fade out `Stage.excess`. Row: cycle after the nominal end of the step.
+    #: (m,) weights from 1 to 0 that fade out `Stage.excess`. Row: cycle after the last cycle with the guide.
     fade: Vector
 
 
@@ -379,9 +381,9 @@ def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts
     """Let the virtual guide drive sagittal hip and knee (SH, SK) of the swing leg, and set the vibration levels.
 
     The torques of the guide replace the torques of the baseline controller (PID). After the nominal end of the step, the baseline
-    controller lowers the foot. `Stage.excess` is the torque of the guide minus the torque of the baseline controller in the last
-    cycle with the guide. This difference is added to the torque of the baseline controller and fades out with `fade`, so the
-    command is continuous.
+    controller lowers the foot. It also takes over if the guide ends earlier (`Stage.last_guided`). `Stage.excess` is the torque
+    of the guide minus the torque of the baseline controller in the last cycle with the guide. This difference is added to the
+    torque of the baseline controller and fades out with `fade`, so the command is continuous.
 
     Args:
         cycle: cycles since the start of the step.
@@ -393,7 +395,7 @@ def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts
     q, qd, sent = measured.q, measured.qd, measured.sent
     desired, torque, gravity = output.desired, output.torque, output.gravity
     hip, knee = _LEG * (1 - stage.stance) + _SH, _LEG * (1 - stage.stance) + _SK
-    last = len(assistance.unmodelled) - 1
+    last = stage.last_guided
     if cycle <= last:
         added = assistance.unmodelled[cycle]
         if stage.literal:

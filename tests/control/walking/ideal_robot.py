@@ -46,6 +46,7 @@ class Ideal:
             valid=valid,
             age=np.zeros(22, np.int64),
             joints_valid=True,
+            joint_rows=tuple(range(6, 18)),
             foot_rows=(0, 1),
             imu_rows=(2, 3, 4, 5),
         )

@@ -24,6 +24,8 @@ from atalante_hal.robot import IMUS, JOINTS, MOTORS
 from atalante_hal.types import Command, State
 from tests.control.walking.ideal_robot import PATIENT, ROBOT, WALK, Ideal, walk_with
 
+KNEES = [JOINTS.index("left_SK"), JOINTS.index("right_SK")]
+
 
 def walked(
     engine: str,
@@ -564,11 +566,64 @@ def test_guide_and_vibration_are_off_at_full_assistance() -> None:
     assert not controller.certificates(1.0)[0].certified
 
 
+@pytest.mark.parametrize("delay", [1, 2])
+def test_guide_acts_only_if_it_covers_the_delay_of_the_loop(delay: int) -> None:
+    controller = WalkController(ROBOT, PATIENT, WALK, 2)
+    late, seen = walk_in_guide(controller, delay=delay), controller.statistics.guide
+    assert len(late) == seen.late == (2 if delay == 2 else 0)
+    assert (seen.cycles == 0) == (delay == 2)
+
+
+def test_guide_ends_within_the_step_if_data_becomes_late() -> None:
+    """The baseline controller takes over. The torque of the guide fades out."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 2)
+    late = walk_in_guide(controller, late_from=0.4)
+    seen = controller.statistics.guide
+    assert len(late) == seen.late == 2
+    (first, jump), (second, _) = late
+    assert first == pytest.approx(0.4, abs=0.02)
+    assert seen.cycles == round(first * WALK.step.duration * 1000.0)  # the fifth late cycle has no guide
+    assert jump < 2.0
+    assert second == 0.0
+
+
+def walk_in_guide(
+    controller: WalkController, *, delay: int = 0, late_from: float | None = None
+) -> list[tuple[float, float]]:
+    """Walk in a guide to standing. Return when the command was late: phase of the step, and largest change of a knee torque [Nm].
+
+    Args:
+        controller: controller of the walk.
+        delay: delay of the torques that the HAL measured at START [cycles].
+        late_from: phase of the first step from which on the data of both knees is 3 cycles old. None if it is always new.
+    """
+    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.0005)
+        robot, late = Ideal(body), []
+        state = robot.state
+        state.assistance_factor, state.delay = 0.5, delay
+        before = np.zeros(12)
+        while controller.phase is not Phase.REST:
+            if late_from is not None and controller.reached(0, late_from):
+                state.age[[state.joint_rows[joint] for joint in KNEES]] = 3
+            command = robot.cycle(controller)
+            if command.late:
+                jump = np.abs(command.torque - before)[KNEES].max()
+                late.append((fields_of(controller)["elapsed"].item() / WALK.step.duration, float(jump)))
+            before[:] = command.torque
+            assert robot.upright()
+    finally:
+        body.close()
+    return late
+
+
 @pytest.mark.parametrize("assisted", [False, True])
 def test_literal_law_limits_the_integral_only_outside_the_periodic_steps(assisted: bool) -> None:
     """In a guided step, the integrals of hip and knee of the swing leg stand still, because the guide drives them."""
     controller = WalkController(ROBOT, PATIENT, WALK, 2, WalkConfig.literal(), CONSTANT)
     state = hung(controller)
+    state.assistance_factor = 0.5 if assisted else 1.0
     state.torque_sent = controller._pid.requested  # no torque is limited
     controller.reset(state)
     record, hip, swinging = controller._pid.records[0], JOINTS.index("left_SH"), (8, 9)  # the right leg swings
@@ -576,7 +631,7 @@ def test_literal_law_limits_the_integral_only_outside_the_periodic_steps(assiste
     def follow(phase: Phase) -> np.ndarray:
         """Start a phase; return the growth of the integrals in 100 cycles in which all joints are far below their targets."""
         state.position[:] = 0.0
-        controller._begin(phase, state.cycle, 0.5 if assisted else 1.0)
+        controller._begin(phase, state)
         before = record.integral.copy()
         state.position[:] = -3.0
         for _ in range(100):
@@ -586,7 +641,7 @@ def test_literal_law_limits_the_integral_only_outside_the_periodic_steps(assiste
 
     follow(Phase.SHIFT)
     assert np.abs(record.integral).max() == 10.0
-    controller._begin(Phase.START, state.cycle, 1.0)
+    controller._begin(Phase.START, state)
     grown = follow(Phase.STEP)
     assert abs(grown[hip]) > 20.0
     assert [grown[joint] == 0.0 for joint in swinging] == [assisted, assisted]

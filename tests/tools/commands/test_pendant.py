@@ -26,6 +26,7 @@ from atalante_tools.cli import cli
 from atalante_tools.commands import pendant
 from atalante_tools.commands.emulator_line import Line
 from atalante_tools.console.options import Target
+from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import StopRequest
 from atalante_tools.session import pendant_session
 from atalante_tools.session.pendant_node import PendantNode, Request
@@ -659,6 +660,17 @@ def test_displaced_session_ends_with_a_message(world: World, capsys: pytest.Capt
     older.run(None)
     assert capsys.readouterr().err.endswith("the HAL is ACTIVE\nanother pendant has taken over\n")
     assert world.hal.state.supervisor is ACTIVE
+
+
+def test_failed_takeover_states_the_state_of_the_hal(world: World) -> None:
+    hardware = world.active()
+    hardware._takeover.answer = lambda counter: False  # type: ignore[method-assign]
+    newer = world.session()
+    newer.node.press(Request.STOP)
+    newer.take_over()
+    newer.answer_syncs(200)
+    with pytest.raises(Failed, match="in use on this bus, and the HAL is in HOLD: operate the robot with that pendant"):
+        newer.check_takeover()
 
 
 def test_missing_hal_is_reported_once_while_the_pendant_waits(world: World, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
+from atalante_hal.types import PERIOD
 from atalante_tools.console.terminal import print_message
 
 if TYPE_CHECKING:
@@ -57,14 +58,15 @@ def announce(certificates: Collection[Certificate], mismatch: Mismatch, leg: str
         )
     if any(certificate.certified for certificate in certificates):
         print_message(
-            "the promise includes joint torque and rate limits, delay, the torque jump at a stance change, and errors of "
-            f"friction ({100.0 * mismatch.friction:g} %) and inertia ({100.0 * mismatch.inertia:g} %); it is made for the {leg}, "
-            "and for steps that start inside the hand-over box. Steps that start outside are counted"
+            f"the promise includes joint torque and rate limits, delay ({_covered_delay()} more than normal), the torque jump at "
+            f"a stance change, and errors of friction ({100.0 * mismatch.friction:g} %) and inertia "
+            f"({100.0 * mismatch.inertia:g} %); it is made for the {leg}, and for steps that start inside the hand-over box. "
+            "Steps that start outside are counted"
         )
 
 
 def report_hand_overs(name: str, statistics: GuideStatistics) -> None:
-    """Print in how many steps the certificate did not apply. Print nothing if it applied in every step.
+    """Print in how many steps the certificate did not apply, and how many had no guide. Print nothing if there is no such step.
 
     Args:
         name: Name of the guide shape.
@@ -75,3 +77,15 @@ def report_hand_overs(name: str, statistics: GuideStatistics) -> None:
             f"{name}: the certificate did not apply to {statistics.hand_overs_exceeded} of {statistics.hand_overs} steps: at the "
             "stance change, an angle, a speed, an acceleration or a torque jump was larger than the certificate assumes"
         )
+    if statistics.late:
+        print_message(
+            f"{name}: {statistics.late} steps had full assistance, at least in part, because data or torques were more than "
+            f"{_covered_delay()} late"
+        )
+
+
+def _covered_delay() -> str:
+    """Return the additional delay that the guides cover, as text."""
+    from atalante_control.guide.loop_delay import COVERED
+
+    return f"{1e3 * COVERED * PERIOD:g} ms"

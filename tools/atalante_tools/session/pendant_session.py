@@ -163,8 +163,9 @@ class Session:
             Failed: If the other pendant did not stop.
         """
         if self.node.takeover_failed:
+            state = f", and the HAL is in {self.node.hal.name}" if self.node.hal is not None else ""
             raise Failed(
-                "another pendant is already in use on this bus: operate the robot with that pendant, or end it first"
+                f"another pendant is already in use on this bus{state}: operate the robot with that pendant, or end it first"
             )
 
     def _release_after_loss(self) -> None:

@@ -1,0 +1,63 @@
+"""Additional delay of the control loop, compared with the delay that the guides cover: `delay at START, ages -> late or not`.
+
+The certificate of a guide covers a loop with one more cycle of delay than normal (`prediction.DELAYS`). With more delay, the
+backup policy may oscillate. So a step starts without a guide, or its guide ends early, and the patient gets full assistance.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from atalante_control.guide.prediction import DELAYS
+from atalante_hal.robot import JOINTS, SIDES
+from atalante_hal.types import State
+
+#: Largest additional delay that the certificate of a guide covers [cycles].
+COVERED: Final = DELAYS[1] - DELAYS[0]
+#: The delay stays uncovered after this number of consecutive cycles. Single lost frames also make the data old, but are harmless.
+_CONFIRM: Final = 5
+#: Indices in JOINTS of the joints with a guide: sagittal hip and knee of both legs.
+_GUIDED: Final = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SH", "SK")]
+
+
+class LoopDelay:
+    """Additional delay from the measurement of a guided joint to its torque.
+
+    It is the sum of the delay that the HAL measured at START (`State.delay`) and of the ages of the data. The delay at START
+    already contains the ages at START.
+    """
+
+    def __init__(self) -> None:
+        self._at_start = 0  # additional delay at START without the ages of the data [cycles]
+        self._uncovered = 0  # number of consecutive cycles with an uncovered delay
+
+    def reset(self, state: State) -> None:
+        """Store the delay that was measured at START.
+
+        Args:
+            state: measured state of the robot after START.
+        """
+        self._at_start, self._uncovered = max(0, state.delay - _oldest(state)), 0
+
+    def is_covered(self, state: State) -> bool:
+        """Return whether the certificate of a guide covers the delay of this cycle.
+
+        Args:
+            state: measured state of the robot.
+        """
+        return self._at_start + _oldest(state) <= COVERED
+
+    def stays_uncovered(self, state: State) -> bool:
+        """Count one cycle, and return whether the delay has been uncovered in several consecutive cycles.
+
+        Args:
+            state: measured state of the robot.
+        """
+        self._uncovered = 0 if self.is_covered(state) else self._uncovered + 1
+        return self._uncovered >= _CONFIRM
+
+
+def _oldest(state: State) -> int:
+    """Return the largest age of the data of the guided joints [cycles]; 0 if the ages are unknown."""
+    rows, age = state.joint_rows, state.age
+    return max(age.item(rows[joint]) for joint in _GUIDED) if rows else 0
