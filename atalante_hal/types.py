@@ -14,6 +14,8 @@ Vector = npt.NDArray[np.float64]
 
 #: Period [s] of the SYNC message and of the control loop.
 PERIOD = 1e-3
+#: Gravitational acceleration [m/s2].
+GRAVITY = 9.81
 
 
 class SupervisorState(IntEnum):

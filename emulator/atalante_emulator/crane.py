@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from atalante_emulator.bodies import GRAVITY, PELVIS, Body, Motion
-from atalante_hal.types import PERIOD, SupervisorState, Vector
+from atalante_emulator.bodies import PELVIS, Body, Motion
+from atalante_hal.types import GRAVITY, PERIOD, SupervisorState, Vector
 
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1

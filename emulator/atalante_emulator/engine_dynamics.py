@@ -11,11 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 import pybullet
 
-from atalante_emulator.bodies import GRAVITY
 from atalante_emulator.bodies.pybullet_body import load_urdf
 from atalante_hal.closing import Closing
 from atalante_hal.robot import JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import GRAVITY, Vector
 
 Pose = tuple[Sequence[float], Sequence[float]]  # pose of a frame in PyBullet: position (3) [m] and quaternion xyzw (4)
 

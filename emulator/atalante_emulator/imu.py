@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from atalante_emulator.bodies import GRAVITY, LINK_STATE
+from atalante_emulator.bodies import LINK_STATE
 from atalante_hal.compiled import compiled
-from atalante_hal.types import PERIOD, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Vector
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ from typing import Final
 
 import numpy as np
 
-from atalante_emulator.bodies import GRAVITY, Body
+from atalante_emulator.bodies import Body
 from atalante_emulator.wearer import LimbParameters, PassiveWearer
 from atalante_hal.robot import LEG_JOINTS, MOTORS, SIDES
-from atalante_hal.types import PERIOD, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Vector
 
 Pair = tuple[float, float]
 

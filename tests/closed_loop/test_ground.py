@@ -8,10 +8,10 @@ import pytest
 from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
-from atalante_emulator.bodies import ENGINES, GRAVITY
+from atalante_emulator.bodies import ENGINES
 from atalante_emulator.faults import Fault
 from atalante_emulator.mechanics import Ground, Mechanics
-from atalante_hal.types import State, SupervisorState
+from atalante_hal.types import GRAVITY, State, SupervisorState
 from atalante_hal.wire.frame import Frames
 from atalante_tools.console.options import Target
 from atalante_tools.session.body import describe

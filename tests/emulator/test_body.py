@@ -7,20 +7,10 @@ import pinocchio
 import pytest
 
 from atalante_control.model import ExoskeletonParameters, Patient, imu_link, pad_link, pinocchio_model, urdf
-from atalante_emulator.bodies import (
-    ENGINES,
-    FRICTION,
-    GRAVITY,
-    Body,
-    DivergedError,
-    Pose,
-    hang,
-    lowest_corner,
-    make_body,
-)
+from atalante_emulator.bodies import ENGINES, FRICTION, Body, DivergedError, Pose, hang, lowest_corner, make_body
 from atalante_emulator.bodies.links import FOOT_LINKS
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
-from atalante_hal.types import PERIOD
+from atalante_hal.types import GRAVITY, PERIOD
 
 ROBOT = load_robot()
 TEXT = urdf(ExoskeletonParameters(), ROBOT)

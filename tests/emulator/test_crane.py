@@ -9,13 +9,13 @@ import pytest
 
 from atalante_control.model import ExoskeletonParameters, Patient, urdf
 from atalante_dbc import Network
-from atalante_emulator.bodies import ENGINES, GRAVITY, Body, Pose, lowest_corner
+from atalante_emulator.bodies import ENGINES, Body, Pose, lowest_corner
 from atalante_emulator.crane import DELAY, Crane
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.mechanics import Ground, Mechanics
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.robot import load_robot
-from atalante_hal.types import PERIOD, SupervisorState
+from atalante_hal.types import GRAVITY, PERIOD, SupervisorState
 from atalante_hal.wire.frame import new_frames
 from atalante_hal.wire.process_image import TransmitImage
 

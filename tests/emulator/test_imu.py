@@ -7,11 +7,10 @@ import pinocchio
 import pytest
 
 from atalante_control.model import imu_link, pinocchio_model
-from atalante_emulator.bodies import GRAVITY
 from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_hal.robot import IMUS
-from atalante_hal.types import PERIOD
+from atalante_hal.types import GRAVITY, PERIOD
 
 
 def signals() -> ImuSignals:

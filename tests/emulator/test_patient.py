@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from atalante_control.model import ExoskeletonParameters, Patient, urdf
-from atalante_emulator.bodies import GRAVITY
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.mechanics import Mechanics
 from atalante_emulator.patient import ActiveParameters, ActivePatient, ActiveTask
 from atalante_emulator.wearer import LimbParameters
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.robot import MOTORS
+from atalante_hal.types import GRAVITY
 
 CYCLES = 400  # of a step
 LIMP = LimbParameters((0.0,) * 6, (0.0,) * 6, (0.0,) * 6)

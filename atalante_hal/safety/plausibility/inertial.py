@@ -42,7 +42,7 @@ from atalante_hal.robot import IMUS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import IMU_NODES, Ages, Cycles, Signals
 from atalante_hal.safety.plausibility.imus import ImuLimits, usable_one
-from atalante_hal.types import Vector
+from atalante_hal.types import GRAVITY, Vector
 from atalante_hal.wire.process_image import NEVER
 
 #: Number of samples in each mean. Before this number is reached, a mean is over all samples since the start.
@@ -51,7 +51,6 @@ SAMPLES = 64
 #: Torso and pelvis need only 4 samples, so their faults are found before READY.
 #: The tibiae need more samples, because they accelerate before READY: the drives are off, and bent legs sink.
 FIRST_SAMPLES = (4, 4, 16, 16)
-GRAVITY = 9.81  # m/s2
 #: Limit of the mean difference between specific force and gravity [m/s2]. A healthy robot reaches 2.2 m/s2 in walks and falls.
 _FORCE_ERROR = 3.0
 #: Each sample of the difference between specific force and gravity is clipped to this magnitude [m/s2].

@@ -15,11 +15,11 @@ from typing import Annotated
 import numpy as np
 import pinocchio
 
-from atalante_control.model import GRAVITY, ArticulatedModel
+from atalante_control.model import ArticulatedModel
 from atalante_control.structured import Records, zeros
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS
-from atalante_hal.types import Vector
+from atalante_hal.types import GRAVITY, Vector
 from atalante_hal.vectors import cross, rotated
 
 Attitude = tuple[float, float, float, float]  # unit quaternion wxyz

@@ -24,9 +24,9 @@ from atalante_control.gait_optimization.nlp import Indices, NonlinearProgram, Ro
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.result import Residual
 from atalante_control.gait_optimization.symbolic_dynamics import Chain
-from atalante_control.model import GRAVITY, ExoskeletonParameters, Patient, links
+from atalante_control.model import ExoskeletonParameters, Patient, links
 from atalante_hal.robot import JOINTS, Robot
-from atalante_hal.types import Vector
+from atalante_hal.types import GRAVITY, Vector
 
 Symbol = Any  # casadi.SX
 TRANSITION = 1.2  # s, duration of start and stop steps

@@ -16,9 +16,9 @@ import numpy as np
 import pinocchio
 
 from atalante_control.gait.gait import POSITION_JUMP, SIGN, SWAP, VELOCITY_JUMP, Gait
-from atalante_control.model import BASE_LINK, GRAVITY, LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
+from atalante_control.model import BASE_LINK, LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import SIDES, Robot
-from atalante_hal.types import Vector
+from atalante_hal.types import GRAVITY, Vector
 
 _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # number of samples of a step

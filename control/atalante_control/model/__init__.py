@@ -5,7 +5,7 @@ follow REP-103: x forward, y left, z up. The frame of a link is the frame of its
 except the frames of ankle, foot and contact pads, which are turned outwards by the toe-out angle.
 """
 
-from atalante_control.model.articulated import GRAVITY, ArticulatedModel, pinocchio_model
+from atalante_control.model.articulated import ArticulatedModel, pinocchio_model
 from atalante_control.model.exoskeleton import (
     BASE_LINK,
     LEG_LINKS,
@@ -20,7 +20,6 @@ from atalante_control.model.urdf_writer import urdf, urdf_text
 
 __all__ = [
     "BASE_LINK",
-    "GRAVITY",
     "HEIGHT_RANGE",
     "LEG_LINKS",
     "LEG_RANGE",

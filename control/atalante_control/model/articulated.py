@@ -10,8 +10,6 @@ import pinocchio
 
 from atalante_hal.robot import JOINTS
 
-GRAVITY = 9.81  # m/s2, magnitude of the gravitational acceleration; the default of Pinocchio
-
 
 class ArticulatedModel(NamedTuple):
     """Pinocchio model with the index of each of `JOINTS` in the vectors of Pinocchio."""

@@ -23,12 +23,11 @@ from typing import Annotated
 
 import numpy as np
 
-from atalante_control.model import GRAVITY
 from atalante_control.structured import Records, zeros
 from atalante_control.walking.heading import HeadingConfig, HeadingFilter
 from atalante_control.walking.rotation import about_z, rotation_of
 from atalante_hal.compiled import compiled
-from atalante_hal.types import PERIOD, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Vector
 from atalante_hal.vectors import Vector3, cross
 
 

@@ -27,7 +27,7 @@ from atalante_control.guide.shapes import PINCHED, GuideShape
 from atalante_control.joint.flat_foot import ankle_records, flat_feet
 from atalante_control.joint.haptics import intensity
 from atalante_control.joint.pid import LEFT, RIGHT, Pid
-from atalante_control.model import GRAVITY, ExoskeletonParameters, Patient, pinocchio_model, urdf
+from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_control.structured import Records, zeros
 from atalante_control.walking.attitude import AttitudeObserver
 from atalante_control.walking.config import WalkConfig
@@ -57,7 +57,7 @@ from atalante_control.walking.steering import Steering
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS, Telemetry, WalkStatistics
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, Robot
-from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Command, State, SupervisorState, Vector
 
 Pair = tuple[float, float]
 

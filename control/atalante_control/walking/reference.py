@@ -18,12 +18,11 @@ from atalante_control.gait.gait import Gait, bezier, derivative
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.joint.flat_foot import recentring_rows
 from atalante_control.joint.pid import RIGHT
-from atalante_control.model import GRAVITY
 from atalante_control.walking.kinematics import Kinematics
 from atalante_control.walking.rotation import about_z
 from atalante_control.walking.standing import Shift
 from atalante_hal.robot import LEG_JOINTS
-from atalante_hal.types import PERIOD, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Vector
 from atalante_hal.vectors import cross
 
 _LEG = len(LEG_JOINTS)

@@ -15,10 +15,10 @@ import pinocchio
 
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import GaitError, control_points
-from atalante_control.model import GRAVITY, ArticulatedModel, ExoskeletonParameters
+from atalante_control.model import ArticulatedModel, ExoskeletonParameters
 from atalante_control.walking.rotation import about_z
 from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
-from atalante_hal.types import Vector
+from atalante_hal.types import GRAVITY, Vector
 
 _LEG = len(LEG_JOINTS)
 _ITERATIONS = 50  # largest number of iterations of the inverse kinematics for a pose

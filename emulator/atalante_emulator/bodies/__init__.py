@@ -16,7 +16,6 @@ from atalante_hal.types import Vector
 
 Vector3 = tuple[float, float, float]
 
-GRAVITY: Final = 9.81  # m/s2
 #: Number of elements of a link state: quaternion xyzw (4), velocity [m/s] (3), angular velocity [rad/s] (3), all in world axes.
 LINK_STATE: Final = 10
 #: Name of the root link.

@@ -8,12 +8,12 @@ from typing import Any, Final, NamedTuple
 import mujoco
 import numpy as np
 
-from atalante_emulator.bodies import FRICTION, GRAVITY, LINK_STATE, PELVIS, DivergedError, Motion, Pose
+from atalante_emulator.bodies import FRICTION, LINK_STATE, PELVIS, DivergedError, Motion, Pose
 from atalante_emulator.bodies.links import FOOT_LINKS, IMU_LINKS, PAD_LINKS, find
 from atalante_emulator.bodies.soles import into_frame, read_soles, total_mass
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
-from atalante_hal.types import PERIOD, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Vector
 
 #: MuJoCo's vector `qpos` starts with this number of elements for a free pelvis: position (3) and quaternion wxyz (4).
 _FREE: Final = 7

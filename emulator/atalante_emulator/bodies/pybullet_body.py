@@ -11,12 +11,12 @@ from typing import Any, Final
 import numpy as np
 import pybullet
 
-from atalante_emulator.bodies import FRICTION, GRAVITY, LINK_STATE, PELVIS, Motion, Pose
+from atalante_emulator.bodies import FRICTION, LINK_STATE, PELVIS, Motion, Pose
 from atalante_emulator.bodies.links import FOOT_LINKS, IMU_LINKS, PAD_LINKS, find
 from atalante_emulator.bodies.soles import into_frame, read_soles, total_mass
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
-from atalante_hal.types import PERIOD, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Vector
 
 #: Number of PyBullet solver iterations in each time step. Another number changes the computed motion.
 SOLVER_ITERATIONS = 50

@@ -7,8 +7,9 @@ import pytest
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.dynamics.stance import STANCE_FOOT, StanceDynamics, stance_dynamics
 from atalante_control.gait.gait import AIRWALK_GAIT, bezier, load_gait, motion
-from atalante_control.model import GRAVITY, ExoskeletonParameters, Patient, pinocchio_model, urdf
+from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import load_robot
+from atalante_hal.types import GRAVITY
 
 ROBOT = load_robot()
 PATIENT = Patient(75.0, 1.75)

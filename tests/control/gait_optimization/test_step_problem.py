@@ -13,8 +13,9 @@ from atalante_control.gait_optimization.guess import guess
 from atalante_control.gait_optimization.nlp import Functions
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.step_problem import StepProblem
-from atalante_control.model import GRAVITY, Patient
+from atalante_control.model import Patient
 from atalante_hal.robot import JOINTS, load_robot
+from atalante_hal.types import GRAVITY
 
 ROBOT, REQUIREMENTS = load_robot(), Requirements()
 SUBJECT = Subject(Patient(75.0, 1.75), 0.16, 0.8)

@@ -13,6 +13,7 @@ from atalante_control.dynamics.gait_network import load_network
 from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import load_robot
+from atalante_hal.types import GRAVITY
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 
 _PATIENT: Final = Patient(75.0, 1.75)
@@ -45,7 +46,7 @@ def inverse_dynamics(effort: Effort) -> Measurement:
     rng = np.random.default_rng(0)
     states = [(rng.uniform(robot.position_min, robot.position_max), *rng.normal(size=(2, 12))) for _ in range(64)]
     floating = [(np.r_[np.zeros(6), 1.0, q], np.r_[np.zeros(6), v], np.r_[np.zeros(6), a]) for q, v, a in states]
-    weight = pinocchio.computeTotalMass(model) * 9.81
+    weight = pinocchio.computeTotalMass(model) * GRAVITY
     force = dynamics.forces(states[0][0], np.zeros(12), np.zeros(12)).force
     require(
         abs(force[2] - weight) < 1e-6, f"ground force must equal the weight of {weight:.1f} N, got {force[2]:.1f} N"

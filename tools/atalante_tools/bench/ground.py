@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from atalante_control.model import Patient
-from atalante_emulator.bodies import ENGINES, GRAVITY, Body, hang, make_body
+from atalante_emulator.bodies import ENGINES, Body, hang, make_body
 from atalante_hal.robot import load_robot
+from atalante_hal.types import GRAVITY
 from atalante_tools.bench.measure import Block, Effort, Measurement, require
 from atalante_tools.session.body import describe, no_banner
 

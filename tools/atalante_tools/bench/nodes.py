@@ -26,8 +26,7 @@ from atalante_hal.bus import Stamps
 from atalante_hal.hal import Hal
 from atalante_hal.robot import JOINTS, Robot, load_robot
 from atalante_hal.safety.direction import DirectionProof
-from atalante_hal.safety.plausibility.inertial import GRAVITY
-from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.e2e import COUNTER_BYTE
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
@@ -207,7 +206,7 @@ def _walking(image: TransmitImage) -> Vector:
             values[column] = 30.0
         elif signal.name == "DriveState":
             values[column] = DriveState.OPERATION_ENABLED
-    values[codec.slice("Accel")][2::3] += 9.81
+    values[codec.slice("Accel")][2::3] += GRAVITY
     values[codec.slice("Quaternion")][::4] = 1.0
     for name, value in (("DeadMan", 1.0), ("AssistanceSet", 1.0), ("AssistanceFactor", ASSISTANCE)):
         values[codec.index("PENDANT_STATE", name)] = value

@@ -8,12 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from atalante_hal.types import PERIOD, Vector
+from atalante_hal.types import GRAVITY, PERIOD, Vector
 from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 
-GRAVITY: Final = 9.81  # m/s2
 #: Number of cycles in which a test measures a sensor.
 _MEASURED: Final = 100
 NORM: Final = 1e-3  # the length of a quaternion may differ from 1 by at most this number

@@ -14,15 +14,8 @@ from atalante_hal.robot import IMUS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.finding import IMU_NODES, Ages, Signals
 from atalante_hal.safety.plausibility.imus import ImuLimits
-from atalante_hal.safety.plausibility.inertial import (
-    FIRST_SAMPLES,
-    GRAVITY,
-    SAMPLES,
-    Inertial,
-    to_world,
-    turn_rate,
-    upward,
-)
+from atalante_hal.safety.plausibility.inertial import FIRST_SAMPLES, SAMPLES, Inertial, to_world, turn_rate, upward
+from atalante_hal.types import GRAVITY
 from atalante_hal.wire.process_image import NEVER
 
 TORSO, PELVIS = IMUS.index("torso"), IMUS.index("pelvis")

@@ -15,7 +15,6 @@ from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import IMUS, JOINTS, SIDES
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.finding import Signals
-from atalante_hal.safety.plausibility.inertial import GRAVITY
 from atalante_hal.safety.plausibility.knees import (
     FRONTAL_HIP,
     PELVIS_IMU,
@@ -26,6 +25,7 @@ from atalante_hal.safety.plausibility.knees import (
     motion,
 )
 from atalante_hal.safety.plausibility.support import SEGMENT
+from atalante_hal.types import GRAVITY
 
 MODEL = ExoskeletonParameters()
 PELVIS, TIBIA = IMUS.index("pelvis"), IMUS.index("left_tibia")
