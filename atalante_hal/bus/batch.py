@@ -14,17 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.wire.frame import (
-    FD_LENGTHS,
-    FLAG_FDF,
-    FRAME,
-    ID_ERROR,
-    ID_EXTENDED,
-    ID_MASK,
-    ID_REMOTE,
-    Frames,
-    as_words,
-)
+from atalante_dbc.network import FD_LENGTHS
+from atalante_hal.wire.frame import FLAG_FDF, FRAME, ID_ERROR, ID_EXTENDED, ID_MASK, ID_REMOTE, Frames, as_words
 
 #: Largest number of entries in a cache. A full cache is emptied.
 #: One entry is an array or a batch of frames; a HAL or an emulator uses about five arrays and five batches.

@@ -33,9 +33,6 @@ ID_EXTENDED = 1 << 31
 ID_REMOTE = 1 << 30
 ID_ERROR = 1 << 29
 
-#: Payload lengths that CAN FD supports (ISO 11898-1) [bytes].
-FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-
 Frames = npt.NDArray[Any]
 
 

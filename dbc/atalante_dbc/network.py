@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
 
+#: Payload lengths that CAN FD supports (ISO 11898-1) [byte].
+FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 #: Largest signal length [bit]. The codec rounds integers of at most this length exactly.
 LONGEST_SIGNAL = 51
 #: Signals of the E2E Profile 5 header at the start of a payload: start bit and number of bits.

@@ -20,10 +20,18 @@ from cantools.database.can import Signal as RawSignal
 from cantools.database.errors import Error as CantoolsError
 
 from atalante_dbc.attributes import missing, wrong_values
-from atalante_dbc.network import E2E_HEADER, LONGEST_SIGNAL, DbcError, Message, Network, Node, Signal, decoded_text
+from atalante_dbc.network import (
+    E2E_HEADER,
+    FD_LENGTHS,
+    LONGEST_SIGNAL,
+    DbcError,
+    Message,
+    Network,
+    Node,
+    Signal,
+    decoded_text,
+)
 
-#: Valid payload lengths of CAN FD [byte] (ISO 11898-1).
-_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 _FD_FORMAT = "StandardCAN_FD"
 _BO = re.compile(r"BO_\s+(\d+)\s+(\w+)\s*:\s*(\d+)\s+(\w+)")
 _SG = re.compile(r"SG_\s+(\w+)\s*(\w*)\s*:")
@@ -132,8 +140,8 @@ def _duplicates(lines: _Lines) -> Iterator[tuple[int, str]]:
 
 
 def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
-    if message.length not in _LENGTHS:
-        yield f"must have a length of {', '.join(map(str, _LENGTHS))} bytes, got {message.length} bytes"
+    if message.length not in FD_LENGTHS:
+        yield f"must have a length of {', '.join(map(str, FD_LENGTHS))} bytes, got {message.length} bytes"
     if message.is_extended_frame:
         yield f"must have an 11-bit identifier, got the 29-bit identifier {message.frame_id:#x}"
     if _attribute(message, "VFrameFormat") != _FD_FORMAT:

@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from atalante_dbc import Message, Network
+from atalante_dbc.network import FD_LENGTHS
 from atalante_emulator.motor import MOST_LATE
 from atalante_hal.robot import CELLS
 from atalante_hal.wire.cia402 import DriveState
-from atalante_hal.wire.frame import FD_LENGTHS, ID_MASK
+from atalante_hal.wire.frame import ID_MASK
 
 Value = float | int | str
 

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Message, Network
+from atalante_dbc.network import FD_LENGTHS
 from atalante_hal.wire.e2e import CRC_BYTES, Check, crc, data_id_bytes
-from atalante_hal.wire.frame import FD_LENGTHS, FLAG_BRS, FLAG_FDF, ID_EXTENDED, Frames, new_frames
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 

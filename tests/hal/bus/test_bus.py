@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Message, Network
+from atalante_dbc.network import FD_LENGTHS
 from atalante_hal.bus import Bus, BusAbsent, BusDown, BusError, BusFull, open_bus
 from atalante_hal.bus.batch import is_legal
 from atalante_hal.bus.channel_map import ChannelMapError, open_channels, parse_channel_map
@@ -29,17 +30,7 @@ from atalante_hal.bus.replay import LogUnreadable, ReplayBus
 from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.bus.shared import shared_pair
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.wire.frame import (
-    FD_LENGTHS,
-    FLAG_BRS,
-    FLAG_ESI,
-    FLAG_FDF,
-    ID_ERROR,
-    ID_EXTENDED,
-    ID_REMOTE,
-    Frames,
-    new_frames,
-)
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames, new_frames
 
 BUSES = ("left_leg", "right_leg", "left_sense", "right_sense")
 

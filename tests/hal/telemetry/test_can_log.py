@@ -11,21 +11,12 @@ import numpy as np
 import pytest
 
 import atalante_dbc
+from atalante_dbc.network import FD_LENGTHS
 from atalante_hal.telemetry.can_log import FORMATS, CanLog, check_format
 from atalante_hal.telemetry.frames import FRAME_RECORD, FRAMES_PER_RECORD, RingTap, batches
 from atalante_hal.telemetry.ring import RingReader, RingWriter
 from atalante_hal.telemetry.sink import SinkError
-from atalante_hal.wire.frame import (
-    FD_LENGTHS,
-    FLAG_BRS,
-    FLAG_ESI,
-    FLAG_FDF,
-    ID_ERROR,
-    ID_EXTENDED,
-    ID_REMOTE,
-    Frames,
-    new_frames,
-)
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames, new_frames
 
 
 def random_frames(network: atalante_dbc.Network, count: int, seed: int = 0) -> Frames:

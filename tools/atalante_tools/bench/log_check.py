@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from atalante_dbc.network import FD_LENGTHS
 from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
 from atalante_tools.bench.measure import Block, Effort, Measurement, require
@@ -32,7 +33,6 @@ _REPEATED, _QUICK_REPEATED = 25, 2
 _SLICE = 30_000
 _MS = 1_000_000  # one millisecond [ns]
 _BEGIN = 1_700_000_000 * 1000 * _MS
-_LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 
 
 def validate_log(effort: Effort) -> Measurement:
@@ -252,7 +252,7 @@ def _write_mdf(path: Path, frames: Frames) -> None:
         ("BusChannel", 1),
         ("ID", frames["can_id"]),
         ("DataLength", frames["len"]),
-        ("DLC", np.searchsorted(_LENGTHS, frames["len"])),
+        ("DLC", np.searchsorted(FD_LENGTHS, frames["len"])),
         ("DataBytes", frames["data"]),
         ("EDL", 1),
         ("BRS", 1),

@@ -11,17 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.wire.frame import (
-    FD_LENGTHS,
-    FLAG_BRS,
-    FLAG_ESI,
-    FLAG_FDF,
-    ID_ERROR,
-    ID_EXTENDED,
-    ID_MASK,
-    ID_REMOTE,
-    as_words,
-)
+from atalante_dbc.network import FD_LENGTHS
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_MASK, ID_REMOTE, as_words
 from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, SENT, Chunk
 from atalante_tools.canlog.validate.buses import ChannelMap
