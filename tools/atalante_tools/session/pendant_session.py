@@ -17,6 +17,7 @@ from atalante_tools.console.options import Target
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import StopRequest
 from atalante_tools.console.terminal import print_message
+from atalante_tools.session.listening import POLL_TIMEOUT
 from atalante_tools.session.pendant_node import PendantNode, Request
 
 #: Shortest time for which a new pendant listens for another pendant before it sends [s].
@@ -25,8 +26,6 @@ LISTEN: Final = 0.05
 LISTEN_CYCLES: Final = 3
 #: Time without a SYNC after which the HAL is considered absent [s].
 HAL_TIMEOUT: Final = 1.0
-#: Longest wait for a frame [s]. After this time, stop request and keyboard are checked.
-POLL_TIMEOUT: Final = 0.02
 #: Number of SYNCs that a new pendant answers with the signals of the older pendant. In this time the older pendant stops sending.
 #: If the signals of the two pendants differed, the HAL would hold the robot after four cycles.
 COPY_SYNCS: Final = 20
