@@ -33,6 +33,8 @@ MOTORS = tuple(
 )
 
 ROBOT_FILE = Path(__file__).with_name("robot.toml")
+#: A joint closer to its position limit than this angle [rad] is regarded as being at its end stop.
+AT_STOP = 0.005
 
 
 class RobotError(ValueError):

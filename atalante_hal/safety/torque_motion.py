@@ -37,7 +37,7 @@ import numpy.typing as npt
 
 from atalante_hal.compiled import specialised
 from atalante_hal.leg_model import LegModel
-from atalante_hal.robot import JOINTS, LEG_JOINTS, Robot
+from atalante_hal.robot import AT_STOP, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.leg_torques import History, Sample, Torques, compute, make_history, make_torques, store
 from atalante_hal.safety.plausibility.finding import JOINT_NODES
@@ -79,8 +79,6 @@ _PEAK_DECAY: Final = 0.97
 #: A motor is suspected only if the decaying number of its checks (element 0 of `Deviations.sums`) is at least this value.
 #: Three checks are enough: their decaying number is at least 1 + 0.8 + 0.8^2 = 2.44. Two checks reach at most 1 + 0.96 = 1.96.
 _LEAST_WEIGHT: Final = 2.4
-#: A joint closer to its position limit than this angle [rad] is at its end stop.
-_AT_STOP: Final = 0.005
 _LEG: Final = len(LEG_JOINTS)
 
 
@@ -252,7 +250,7 @@ class TorqueMotion:
             ),
         )  # fmt: skip
         sample = Sample(sent, state.position, state.imu_accel, state.imu_gyro, state.foot_force, state.age, rows)
-        limits = Tolerances(robot.torque_error, robot.position_min + _AT_STOP, robot.position_max - _AT_STOP)
+        limits = Tolerances(robot.torque_error, robot.position_min + AT_STOP, robot.position_max - AT_STOP)
         self._arguments = sample, model, limits, self._memory
         self._check = specialised(_check, 0, *self._arguments)
         self.restart()

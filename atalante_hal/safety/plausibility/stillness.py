@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.compiled import specialised
-from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
+from atalante_hal.robot import AT_STOP, CELLS, FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import (
     FOOT_NODES,
@@ -57,8 +57,6 @@ _INERTIA = 100.0
 _AT_REST = 3
 #: When a joint has turned by this angle [rad], its encoder reading must have changed. The angle is 20 encoder counts.
 _DRIVEN = 1e-5
-#: A joint whose distance to a position limit is below this angle [rad] is regarded as being at its end stop.
-_AT_STOP = 0.005
 #: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since then.
 #: If the last forces of a foot are older than `_FORCES_VALID`, the `Drive` records of its ankles are cleared.
 _FORCES_VALID = 5
@@ -161,7 +159,7 @@ class Stillness:
         #: Shape (4, 3). The rotation vector of an ankle joint is 0 while its foot is not on the ground.
         self._turn = np.zeros((len(_ANKLES), 3))
         self._to_joint: Vector = robot.polarity / robot.gear
-        self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP
+        self._low_stop, self._high_stop = robot.position_min + AT_STOP, robot.position_max - AT_STOP
         #: Finding of each stuck encoder at its last check, by joint index.
         self.encoders: dict[int, Finding] = {}
         #: Indices of the IMUs with a frozen gyro.
