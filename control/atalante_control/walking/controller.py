@@ -68,7 +68,7 @@ _TIBIAE = [IMUS.index(f"{side}_tibia") for side in FEET]
 #: Lean and foot placement request only joint angles that are at least this far inside the position limits [rad].
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
-_SENSOR_AGE = 10
+SENSOR_AGE = 10
 #: Largest expected difference between the weight and the load on the stance foot, as a fraction of the weight.
 #: While one foot swings, the load on the stance foot differs from the weight, because the robot accelerates.
 _LOAD_ERROR = 0.15
@@ -450,7 +450,7 @@ class WalkController:
             self._stage.gyro_source = self._gyro_source = source
         if self.config.heading_reference and not replaced:
             self._observer.follow_heading(state.imu_quaternion[_PELVIS].tolist())
-        feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > _SENSOR_AGE]
+        feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > SENSOR_AGE]
         if len(feet) == 1:
             self._forces[:] = state.foot_force
             self._forces[feet[0], :, 2] = self._load_without(feet[0]) / len(CELLS)
@@ -464,7 +464,7 @@ class WalkController:
 
     def _is_unusable(self, state: State, imu: int) -> bool:
         """Return whether the data of an IMU is too old, or was implausible in this walk."""
-        lost = bool(state.imu_rows) and bool(state.age[state.imu_rows[imu]] > _SENSOR_AGE)
+        lost = bool(state.imu_rows) and bool(state.age[state.imu_rows[imu]] > SENSOR_AGE)
         return lost or imu in self._distrusted
 
     def _vertical_of_stance_leg(self, state: State) -> Vector:

@@ -12,15 +12,17 @@ import pytest
 from atalante_control.guide.shapes import CONSTANT
 from atalante_control.model import ExoskeletonParameters, urdf
 from atalante_control.walking.config import TURN_MAX, WalkConfig
-from atalante_control.walking.controller import StanceError, WalkController
+from atalante_control.walking.controller import SENSOR_AGE, StanceError, WalkController
 from atalante_control.walking.kernel import SOLE, TIBIA
 from atalante_control.walking.lean import LeanConfig
 from atalante_control.walking.phases import STEPPING, Phase
 from atalante_control.walking.placement import PlacementConfig
 from atalante_control.walking.rotation import about_z, rotation_of
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
+from atalante_dbc import Network
 from atalante_emulator.bodies import hang, make_body
 from atalante_hal.robot import IMUS, JOINTS, MOTORS
+from atalante_hal.safety.plausibility.finding import FOOT_MESSAGES, IMU_MESSAGES
 from atalante_hal.types import Command, State
 from tests.control.walking.ideal_robot import PATIENT, ROBOT, WALK, Ideal, walk_with
 
@@ -209,6 +211,10 @@ def test_torso_imu_replaces_an_implausible_pelvis_imu_for_the_rest_of_the_walk(
     controller.reset(state)
     controller.update(state)
     assert controller._measured is controller._measured_by[pelvis]
+
+
+def test_data_of_imus_and_feet_is_valid_up_to_the_timeout_of_its_message(network: Network) -> None:
+    assert {network.message(name).timeout_ms for name in (*IMU_MESSAGES, *FOOT_MESSAGES)} == {SENSOR_AGE}
 
 
 @pytest.mark.parametrize("implausible", ["pelvis", "torso"])
