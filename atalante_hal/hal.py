@@ -17,7 +17,19 @@ from atalante_dbc import Network
 from atalante_hal.bus import Bus
 from atalante_hal.commands import Commands, StatusReport
 from atalante_hal.leg_model import LegModel
-from atalante_hal.record import Record
+from atalante_hal.record import (
+    ASSISTANCE_FACTOR,
+    CRC_ERRORS,
+    CYCLE,
+    DIAGNOSTICS,
+    DIAGNOSTICS_HIGH,
+    DROPPED,
+    FRAMES,
+    OVERRUNS,
+    SUPERVISOR,
+    TIME,
+    Record,
+)
 from atalante_hal.record_layout import split_bits
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, number_of
@@ -123,7 +135,7 @@ class Hal:
         #: `controller_record` is the part of `record` with the fields of the controller.
         self.record, self.layout, self.controller_record = parts.values, parts.layout, parts.controller
         self._header = parts.header
-        self._header[3] = assistance_factor
+        self._header[ASSISTANCE_FACTOR] = assistance_factor
         self._image = ReceiveImage(fast, parts.signals, independent=_INDEPENDENT)
         self._slow_ids = [m.frame_id for m in received if m.cycle_ms != 1]
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
@@ -174,9 +186,9 @@ class Hal:
         self._torque_sent[:] = self._limiter.last
         self._motion[:] = parts.motion
         header = self._header
-        header[0], header[1] = cycle, state.time
-        header[7] += count
-        header[9] = transceiver.bus.dropped
+        header[CYCLE], header[TIME] = cycle, state.time
+        header[FRAMES] += count
+        header[DROPPED] = transceiver.bus.dropped
         return state
 
     def _skip_old_answers(self) -> None:
@@ -202,8 +214,9 @@ class Hal:
         if verdict.acknowledged:
             self._transceiver.acknowledge()
         header = self._header
-        header[2], header[3], header[8] = verdict.supervisor, verdict.assistance_factor, self.crc_errors
-        header[10], header[11] = split_bits(verdict.diagnostics)
+        header[SUPERVISOR], header[ASSISTANCE_FACTOR] = verdict.supervisor, verdict.assistance_factor
+        header[CRC_ERRORS] = self.crc_errors
+        header[DIAGNOSTICS], header[DIAGNOSTICS_HIGH] = split_bits(verdict.diagnostics)
 
     def write(self, command: Command) -> Vector:
         """Limit a command and send it; send HOLD instead while `moving` is False.
@@ -426,7 +439,7 @@ class Hal:
         state, safety_monitor = self.state, self._safety_monitor
         sent = self._commands.send(state.cycle)
         if state.cycle % self._status.cycles == 0:
-            worst, overruns = number_of(safety_monitor.memory.bits), self._header[6]
+            worst, overruns = number_of(safety_monitor.memory.bits), self._header[OVERRUNS]
             self._status.send(state.supervisor, state.assistance_factor, overruns, worst, safety_monitor.step)
             safety_monitor.check_timeouts()
         return sent

@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from atalante_hal.hal import Hal
+from atalante_hal.record import COST, LATENESS, OVERRUNS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import PERIOD, Controller, State
 
@@ -204,7 +205,7 @@ def run(
             cost = time.perf_counter() - began
             costs[min(int(cost * 1e6), COST_BINS)] += 1
             statistics.cycles += 1
-            header[4], header[5], header[6] = cost * 1e6, late * 1e6, statistics.overruns
+            header[COST], header[LATENESS], header[OVERRUNS] = cost * 1e6, late * 1e6, statistics.overruns
             record()
             if until(state):
                 break
