@@ -16,6 +16,7 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.bus import Bus
 from atalante_hal.commands import Commands, StatusReport
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.leg_model import LegModel
 from atalante_hal.record import (
     ASSISTANCE_FACTOR,
@@ -35,7 +36,6 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, number_of
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.safety.safety_monitor import SafetyMonitor, Verdict
 from atalante_hal.safety.start import powered, words_towards_operation
 from atalante_hal.safety.state_machine import Conditions

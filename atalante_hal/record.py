@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from atalante_dbc import Message
+from atalante_hal.dbc_names import FOOT_MESSAGES, IMU_MESSAGES, JOINT_MESSAGES
 from atalante_hal.record_layout import Layout
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
 from atalante_hal.types import State, SupervisorState
@@ -39,9 +40,9 @@ class Record:
 
     def __init__(self, codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> None:
         self.layout = Layout(_fields(codec, controller_fields))
-        self._joint_rows = tuple(codec.rows[f"{joint.upper()}_STATE"] for joint in JOINTS)
-        self._imu_rows = tuple(codec.rows[f"IMU_{imu.upper()}_STATE"] for imu in IMUS)
-        self._foot_rows = tuple(codec.rows[f"FOOT_{foot.upper()}_STATE"] for foot in FEET)
+        self._joint_rows = tuple(codec.rows[message] for message in JOINT_MESSAGES)
+        self._imu_rows = tuple(codec.rows[message] for message in IMU_MESSAGES)
+        self._foot_rows = tuple(codec.rows[message] for message in FOOT_MESSAGES)
         self.values = np.zeros(self.layout.size)
         # Access to one number of a memoryview takes half as long as access to one number of an array.
         self.header = memoryview(self.values.data).cast("B").cast("d")[: len(HEADER_FIELDS)]

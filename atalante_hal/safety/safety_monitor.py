@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from atalante_dbc import Network
+from atalante_hal.dbc_names import IMU_NODES, JOINT_MESSAGES, JOINT_NODES, TRUNK_NODES
 from atalante_hal.leg_model import LegModel
 from atalante_hal.pendant import Pendant
 from atalante_hal.robot import JOINTS, Robot
@@ -27,7 +28,7 @@ from atalante_hal.safety.hold_stability import HoldStability, Measured
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_MESSAGES, JOINT_NODES, TRUNK_NODES, rows_of
+from atalante_hal.safety.plausibility.finding import rows_of
 from atalante_hal.safety.start import (
     ENABLE_CYCLES,
     PROGRAM_ENDS,

@@ -36,11 +36,11 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.compiled import specialised
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.leg_model import LegModel
 from atalante_hal.robot import AT_STOP, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.leg_torques import History, Sample, Torques, compute, make_history, make_torques, store
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import State, Vector
 
 #: Interval between two checks of a leg [cycles]. The legs are checked alternately.

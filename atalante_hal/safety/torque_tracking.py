@@ -21,9 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.compiled import specialised
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import Vector
 
 #: Longest time from sending a torque to the report of this torque by the drive [cycles].

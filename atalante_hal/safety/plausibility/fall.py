@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 
+from atalante_hal.dbc_names import IMU_NODES
 from atalante_hal.robot import IMUS
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import IMU_NODES, Ages, Signals
+from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.inertial import upward
 from atalante_hal.wire.process_image import NEVER
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.dbc_names import FOOT_MESSAGES, IMU_MESSAGES, JOINT_MESSAGES
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec, group_of
@@ -14,17 +15,6 @@ from atalante_hal.wire.process_image import NEVER
 
 Cycles = npt.NDArray[np.int64]
 
-#: Names of the sensor messages, in the order of JOINTS, IMUS and FEET.
-JOINT_MESSAGES = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
-IMU_MESSAGES = tuple(f"IMU_{imu.upper()}_STATE" for imu in IMUS)
-FOOT_MESSAGES = tuple(f"FOOT_{foot.upper()}_STATE" for foot in FEET)
-#: DBC names of the nodes that send the sensor messages. The nodes of the joints are the drives.
-JOINT_NODES, IMU_NODES, FOOT_NODES = (
-    tuple(message.removesuffix("_STATE") for message in messages)
-    for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
-)
-#: DBC names of the IMUs of the trunk.
-TRUNK_NODES = tuple(IMU_NODES[IMUS.index(imu)] for imu in ("torso", "pelvis"))
 #: Quantities of a joint or IMU message that are rejected together if one of them is implausible.
 #: Reason: checks and controllers need values that were measured at the same time.
 #: Joints: the limiter, the velocity check and the controllers need position and velocity of the same time.

@@ -9,9 +9,10 @@ import math
 from typing import NamedTuple
 
 from atalante_hal.compiled import specialised
+from atalante_hal.dbc_names import IMU_NODES
 from atalante_hal.robot import IMUS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import IMU_NODES, Signals
+from atalante_hal.safety.plausibility.finding import Signals
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 

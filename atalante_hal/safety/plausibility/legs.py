@@ -51,9 +51,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
+from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.inertial import to_world, turned_about_vertical
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER

@@ -17,12 +17,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from atalante_hal.dbc_names import IMU_NODES, JOINT_NODES
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.fall import Fall
 from atalante_hal.safety.plausibility.feet import FootChecks
-from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_NODES, Ages, Rows, judged, signals_of
+from atalante_hal.safety.plausibility.finding import Ages, Rows, judged, signals_of
 from atalante_hal.safety.plausibility.imus import IMU_CYCLES, Imus
 from atalante_hal.safety.plausibility.inertial import Inertial
 from atalante_hal.safety.plausibility.knees import KNEE_IMUS, KNEE_JOINTS, Knees

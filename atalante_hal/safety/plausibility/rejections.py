@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from atalante_hal.dbc_names import IMU_NODES, JOINT_NODES
 from atalante_hal.robot import IMUS, JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_NODES
 from atalante_hal.wire.e2e import SETTLED, Qualification, qualify
 
 #: Names and nodes of the sensors whose values can be rejected, by sensor index.

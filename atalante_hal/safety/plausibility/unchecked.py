@@ -15,9 +15,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.dbc_names import FOOT_NODES, IMU_NODES, JOINT_NODES
 from atalante_hal.robot import FEET, IMUS, JOINTS, LEG_JOINTS, SIDES
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES, Cycles, Rows
+from atalante_hal.safety.plausibility.finding import Cycles, Rows
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 

@@ -21,8 +21,8 @@ from atalante_control.walking.rotation import about_z, rotation_of
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
 from atalante_dbc import Network
 from atalante_emulator.bodies import hang, make_body
+from atalante_hal.dbc_names import FOOT_MESSAGES, IMU_MESSAGES
 from atalante_hal.robot import IMUS, JOINTS, MOTORS
-from atalante_hal.safety.plausibility.finding import FOOT_MESSAGES, IMU_MESSAGES
 from atalante_hal.types import Command, State
 from tests.control.walking.ideal_robot import PATIENT, ROBOT, WALK, Ideal, walk_with
 

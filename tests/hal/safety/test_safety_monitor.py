@@ -13,13 +13,13 @@ import pytest
 
 from atalante_dbc import Message, load
 from atalante_emulator.faults import Fault
+from atalante_hal.dbc_names import FOOT_NODES
 from atalante_hal.hal import BRIDGED_ERRORS, SATURATED_CYCLES
 from atalante_hal.robot import CELLS, IMUS, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.hold_stability import REVERSALS
 from atalante_hal.safety.limiter import Limited, Limiter
-from atalante_hal.safety.plausibility.finding import FOOT_NODES
 from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES, RECALL_CYCLES
 from atalante_hal.safety.start import ENABLE_CYCLES, STALLED_CYCLES, WALK_ENDS, stop_text
 from atalante_hal.safety.torque_tracking import CONFIRM, SPAN

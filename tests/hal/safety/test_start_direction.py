@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.direction import (
@@ -14,7 +15,6 @@ from atalante_hal.safety.direction import (
     LATENCY,
     TRAVEL,
 )
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from atalante_dbc import Message, Network, Node, wire_time
+from atalante_hal.dbc_names import JOINT_MESSAGES
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import by_number
 from atalante_hal.wire.frame import Frames
@@ -211,7 +212,7 @@ class Observer:
         return None if register is None or code is None else f"0x{int(code):04X} (register 0x{int(register):02X})"
 
     def _joint(self, index: int) -> JointReport:
-        message = f"{JOINTS[index].upper()}_STATE"
+        message = JOINT_MESSAGES[index]
         ratio = float(self._robot.polarity[index] / self._robot.gear[index])
         position, velocity = self._value(message, "Position"), self._value(message, "Velocity")
         torque = self._value(message, "Torque")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.safety.start import STALLED_CYCLES
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import Frames

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_tools.console.terminal import print_message
 
 if TYPE_CHECKING:

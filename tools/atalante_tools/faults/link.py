@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from atalante_emulator.faults import Fault
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import CELLS
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF
 from atalante_tools.faults.checks import (

@@ -28,8 +28,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from atalante_emulator.faults import Fault
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import JOINTS, LEG_JOINTS
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.safety.start import ENABLE_CYCLES, powered
 from atalante_hal.types import SupervisorState, Vector
 from atalante_tools.console.options import PYBULLET

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from atalante_emulator.faults import Fault
-from atalante_hal.safety.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES
+from atalante_hal.dbc_names import FOOT_NODES, IMU_NODES, JOINT_NODES
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import not_enabled_in_motion
 from atalante_tools.faults.scenario import Case, OperatorAction, Scenario

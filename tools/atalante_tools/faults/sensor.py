@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 from atalante_emulator.faults import Fault
+from atalante_hal.dbc_names import FOOT_NODES, IMU_NODES
 from atalante_hal.robot import CELLS
-from atalante_hal.safety.plausibility.finding import FOOT_NODES, IMU_NODES
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import start_is_rejected
 from atalante_tools.faults.scenario import MID_SWING, Case, OperatorAction, Scenario, invalid_code

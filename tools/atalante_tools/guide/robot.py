@@ -23,8 +23,8 @@ from atalante_control.model import ExoskeletonParameters
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.faults import Fault
 from atalante_emulator.mechanics import Mechanics
+from atalante_hal.dbc_names import JOINT_MESSAGES
 from atalante_hal.robot import JOINTS, LEG_JOINTS
-from atalante_hal.safety.plausibility.finding import JOINT_MESSAGES
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.guide.episode import RATE, Push, Setup

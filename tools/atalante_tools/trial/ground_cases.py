@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from atalante_emulator.faults import Fault
+from atalante_hal.dbc_names import FOOT_NODES, TRUNK_NODES
 from atalante_hal.robot import CELLS
-from atalante_hal.safety.plausibility.finding import FOOT_NODES, TRUNK_NODES
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.scenario import MID_SWING, Case, HostFault, invalid_code
 from atalante_tools.trial.fault_plan import PERMANENT

@@ -10,9 +10,10 @@ import pinocchio
 import pytest
 from simulated_robot import PERIOD, ROBOT, SimulatedRobot, imus, only, signals, signs, specific_force
 
+from atalante_hal.dbc_names import IMU_NODES
 from atalante_hal.robot import IMUS
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility.finding import IMU_NODES, Ages, Signals
+from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.imus import ImuLimits
 from atalante_hal.safety.plausibility.inertial import FIRST_SAMPLES, SAMPLES, Inertial, to_world, turn_rate, upward
 from atalante_hal.types import GRAVITY

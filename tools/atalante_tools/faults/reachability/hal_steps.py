@@ -15,13 +15,13 @@ import numpy as np
 
 import atalante_dbc
 from atalante_emulator.pendant import Request
+from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.hal import Hal
 from atalante_hal.pendant import Pendant
 from atalante_hal.robot import load_robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.fault_memory import FaultMemory
-from atalante_hal.safety.plausibility.finding import JOINT_NODES
 from atalante_hal.safety.safety_monitor import RECALL_CYCLES
 from atalante_hal.safety.state_machine import MOVING
 from atalante_hal.types import Command, SupervisorState
