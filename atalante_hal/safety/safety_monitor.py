@@ -28,7 +28,7 @@ from atalante_hal.safety.hold_stability import HoldStability, Measured
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.plausibility.finding import rows_of
+from atalante_hal.safety.plausibility.signals import rows_of
 from atalante_hal.safety.start import (
     ENABLE_CYCLES,
     PROGRAM_ENDS,

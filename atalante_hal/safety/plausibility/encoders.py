@@ -36,7 +36,7 @@ from atalante_hal.compiled import specialised
 from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Cycles, Signals
+from atalante_hal.safety.plausibility.signals import Cycles, Signals
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 

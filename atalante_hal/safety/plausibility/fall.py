@@ -11,8 +11,8 @@ import math
 from atalante_hal.dbc_names import IMU_NODES
 from atalante_hal.robot import IMUS
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.inertial import upward
+from atalante_hal.safety.plausibility.signals import Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
 #: The robot has fallen if its trunk leans by more than this angle [rad].

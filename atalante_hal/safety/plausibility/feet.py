@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from atalante_hal.dbc_names import FOOT_NODES
 from atalante_hal.robot import CELLS, FEET, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Signals
+from atalante_hal.safety.plausibility.signals import Signals
 
 #: A cell is reported as faulty after it has contradicted the other cells for this time [cycles].
 CELL_CYCLES = 256

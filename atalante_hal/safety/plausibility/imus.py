@@ -12,7 +12,7 @@ from atalante_hal.compiled import specialised
 from atalante_hal.dbc_names import IMU_NODES
 from atalante_hal.robot import IMUS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Signals
+from atalante_hal.safety.plausibility.signals import Signals
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 

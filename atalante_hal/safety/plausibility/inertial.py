@@ -41,8 +41,8 @@ from atalante_hal.compiled import specialised
 from atalante_hal.dbc_names import IMU_NODES
 from atalante_hal.robot import IMUS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Ages, Cycles, Signals
 from atalante_hal.safety.plausibility.imus import ImuLimits, usable_one
+from atalante_hal.safety.plausibility.signals import Ages, Cycles, Signals
 from atalante_hal.types import GRAVITY, Vector
 from atalante_hal.wire.process_image import NEVER
 

@@ -32,8 +32,8 @@ from atalante_hal.compiled import specialised
 from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Signals
 from atalante_hal.safety.plausibility.inertial import to_world, turned_about_vertical
+from atalante_hal.safety.plausibility.signals import Signals
 from atalante_hal.safety.plausibility.support import SEGMENT
 from atalante_hal.types import Vector
 from atalante_hal.vectors import Vector3

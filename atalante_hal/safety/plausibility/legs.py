@@ -54,8 +54,8 @@ import numpy.typing as npt
 from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.inertial import to_world, turned_about_vertical
+from atalante_hal.safety.plausibility.signals import Ages, Signals
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 

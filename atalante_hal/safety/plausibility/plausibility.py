@@ -5,7 +5,7 @@
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU fail a
 check, they are rejected: the process image keeps the previous values, and the age of these values grows. Only the signals in
-`finding.JUDGED` are rejected, so state, temperature and torque of a drive are still updated. If the drive is off, all signals
+`signals.JUDGED` are rejected, so state, temperature and torque of a drive are still updated. If the drive is off, all signals
 of its frame are rejected, so a start waits until its values are accepted. The module `rejections` confirms the diagnostic if
 more than a fifth of the values of a sensor are rejected. Each check uses only the messages that it needs, and the ages of their
 values. So a fault of one message does not disable the checks of other messages.
@@ -23,12 +23,12 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.fall import Fall
 from atalante_hal.safety.plausibility.feet import FootChecks
-from atalante_hal.safety.plausibility.finding import Ages, Rows, judged, signals_of
 from atalante_hal.safety.plausibility.imus import IMU_CYCLES, Imus
 from atalante_hal.safety.plausibility.inertial import Inertial
 from atalante_hal.safety.plausibility.knees import KNEE_IMUS, KNEE_JOINTS, Knees
 from atalante_hal.safety.plausibility.legs import Legs
 from atalante_hal.safety.plausibility.rejections import Rejections
+from atalante_hal.safety.plausibility.signals import Ages, Rows, judged, signals_of
 from atalante_hal.safety.plausibility.soles import Soles
 from atalante_hal.safety.plausibility.stillness import Stillness
 from atalante_hal.safety.plausibility.support import Support

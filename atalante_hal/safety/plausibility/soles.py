@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from atalante_hal.dbc_names import JOINT_NODES
 from atalante_hal.robot import IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Ages, Signals
+from atalante_hal.safety.plausibility.signals import Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive samples with a tilted sole after which an ankle encoder is reported. A foot is sampled every 32 cycles.

@@ -34,7 +34,7 @@ from atalante_hal.compiled import specialised
 from atalante_hal.dbc_names import FOOT_NODES, IMU_NODES, JOINT_NODES
 from atalante_hal.robot import AT_STOP, CELLS, FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Cycles, Signals, measured
+from atalante_hal.safety.plausibility.signals import Cycles, Signals, measured
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 

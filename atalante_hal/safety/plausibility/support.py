@@ -22,7 +22,7 @@ from typing import NamedTuple
 from atalante_hal.dbc_names import FOOT_NODES
 from atalante_hal.robot import FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Ages, Signals
+from atalante_hal.safety.plausibility.signals import Ages, Signals
 
 #: A foot is reported if, for this time [cycles], it alone carries load and is more than `_HEIGHT` above the other foot.
 HEIGHT_CYCLES = 64

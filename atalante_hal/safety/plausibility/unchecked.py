@@ -1,6 +1,6 @@
 """Monitor of the checks that cannot run because their messages contain no usable values.
 
-A check uses values that are younger than the timeout of their message, see `finding.Rows`. If a node sends no message,
+A check uses values that are younger than the timeout of their message, see `signals.Rows`. If a node sends no message,
 the message monitor brings the robot to HOLD within 10 cycles. If a node sends messages without usable values, the robot
 may keep moving. For example, the robot stays in FULL_ASSIST if an IMU permanently sends the code for invalid values.
 Then the encoders of the leg are not checked against the IMUs, and this module reports the missing check. The checks that need
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from atalante_hal.dbc_names import FOOT_NODES, IMU_NODES, JOINT_NODES
 from atalante_hal.robot import FEET, IMUS, JOINTS, LEG_JOINTS, SIDES
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Cycles, Rows
+from atalante_hal.safety.plausibility.signals import Cycles, Rows
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 

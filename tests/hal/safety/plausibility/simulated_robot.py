@@ -16,8 +16,8 @@ from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding, Plausibility
-from atalante_hal.safety.plausibility.finding import Signals, signals_of
 from atalante_hal.safety.plausibility.inertial import turn_rate, upward
+from atalante_hal.safety.plausibility.signals import Signals, signals_of
 from atalante_hal.types import GRAVITY
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import Check

@@ -28,7 +28,7 @@ from atalante_hal.safety.diagnostics import Dtc, Reaction
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.plausibility import Finding, Plausibility
 from atalante_hal.safety.plausibility.encoders import JUMPS_TO_CONFIRM, EncoderChecks
-from atalante_hal.safety.plausibility.finding import Signals, signals_of
+from atalante_hal.safety.plausibility.signals import Signals, signals_of
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 

@@ -13,8 +13,8 @@ from atalante_hal.robot import IMUS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding
 from atalante_hal.safety.plausibility.fall import FALLEN, Fall
-from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.imus import IMU_CYCLES
+from atalante_hal.safety.plausibility.signals import Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
 TORSO, PELVIS = IMUS.index("torso"), IMUS.index("pelvis")

@@ -10,7 +10,7 @@ from atalante_hal.robot import CELLS, FEET
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding
 from atalante_hal.safety.plausibility.feet import FootChecks
-from atalante_hal.safety.plausibility.finding import Signals
+from atalante_hal.safety.plausibility.signals import Signals
 
 
 class TestForceCells:

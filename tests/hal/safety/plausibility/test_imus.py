@@ -13,8 +13,8 @@ from simulated_robot import CODEC, MESSAGES, PERIOD, ROBOT, Change, SimulatedRob
 from atalante_hal.robot import IMUS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.plausibility.finding import Signals
 from atalante_hal.safety.plausibility.imus import Imus
+from atalante_hal.safety.plausibility.signals import Signals
 from atalante_hal.wire.process_image import ReceiveImage
 
 

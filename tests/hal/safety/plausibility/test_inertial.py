@@ -13,9 +13,9 @@ from simulated_robot import PERIOD, ROBOT, SimulatedRobot, imus, only, signals, 
 from atalante_hal.dbc_names import IMU_NODES
 from atalante_hal.robot import IMUS
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.imus import ImuLimits
 from atalante_hal.safety.plausibility.inertial import FIRST_SAMPLES, SAMPLES, Inertial, to_world, turn_rate, upward
+from atalante_hal.safety.plausibility.signals import Ages, Signals
 from atalante_hal.types import GRAVITY
 from atalante_hal.wire.process_image import NEVER
 

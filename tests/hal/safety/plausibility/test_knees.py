@@ -14,7 +14,6 @@ from simulated_robot import GEAR, PERIOD, ROBOT, SimulatedRobot, only, row, sign
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import IMUS, JOINTS, SIDES
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility.finding import Signals
 from atalante_hal.safety.plausibility.knees import (
     FRONTAL_HIP,
     PELVIS_IMU,
@@ -24,6 +23,7 @@ from atalante_hal.safety.plausibility.knees import (
     Readings,
     motion,
 )
+from atalante_hal.safety.plausibility.signals import Signals
 from atalante_hal.safety.plausibility.support import SEGMENT
 from atalante_hal.types import GRAVITY
 

@@ -28,9 +28,9 @@ from atalante_emulator.imu import AttitudeError
 from atalante_emulator.mechanics import GROUND_PARAMETERS
 from atalante_hal.robot import IMUS, JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.inertial import turned_about_vertical
 from atalante_hal.safety.plausibility.legs import DRIFT_SAMPLES, SILENT_SAMPLES, Legs, hip_angles
+from atalante_hal.safety.plausibility.signals import Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
 PELVIS, TIBIAE = IMUS.index("pelvis"), [IMUS.index(f"{side}_tibia") for side in ("left", "right")]

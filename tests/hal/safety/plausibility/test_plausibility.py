@@ -13,9 +13,9 @@ from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Plausibility
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
-from atalante_hal.safety.plausibility.finding import measured, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
+from atalante_hal.safety.plausibility.signals import measured, signals_of
 from atalante_hal.safety.plausibility.soles import Soles
 from atalante_hal.safety.plausibility.stillness import Stillness
 from atalante_hal.safety.plausibility.support import Support

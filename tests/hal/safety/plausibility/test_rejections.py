@@ -11,8 +11,8 @@ from simulated_robot import CODEC, GEAR, Change, SimulatedRobot, must_not_be_cal
 from atalante_hal.robot import IMUS, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
-from atalante_hal.safety.plausibility.finding import Signals
 from atalante_hal.safety.plausibility.rejections import Rejections
+from atalante_hal.safety.plausibility.signals import Signals
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.codec import group_of
 

@@ -23,7 +23,7 @@ from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import IMUS, JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding, Plausibility
-from atalante_hal.safety.plausibility.finding import Signals, signals_of
+from atalante_hal.safety.plausibility.signals import Signals, signals_of
 from atalante_hal.safety.plausibility.trunk import TORSO_HEIGHT
 from atalante_hal.safety.plausibility.unchecked import UNCHECKED_CYCLES
 from atalante_hal.wire.e2e import COUNTER_BYTE

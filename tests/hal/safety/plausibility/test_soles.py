@@ -12,7 +12,7 @@ from simulated_robot import DATA, GEAR, MIDDLE, MODEL, ROBOT, SimulatedRobot, at
 from atalante_control.model import ExoskeletonParameters
 from atalante_hal.robot import FEET, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility.finding import Ages
+from atalante_hal.safety.plausibility.signals import Ages
 from atalante_hal.safety.plausibility.soles import HENKE_AXIS, SOLE_SAMPLES, TOE_OUT, Soles, sole_tilt, stands_flat
 from atalante_hal.wire.process_image import NEVER
 

@@ -24,7 +24,7 @@ from simulated_robot import (
 
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility.finding import Signals, signals_of
+from atalante_hal.safety.plausibility.signals import Signals, signals_of
 from atalante_hal.safety.plausibility.stillness import Stillness
 from atalante_hal.wire.process_image import ReceiveImage
 

@@ -13,7 +13,7 @@ from atalante_control.model import ExoskeletonParameters
 from atalante_hal.robot import FEET, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding
-from atalante_hal.safety.plausibility.finding import Ages
+from atalante_hal.safety.plausibility.signals import Ages
 from atalante_hal.safety.plausibility.support import (
     ANKLE_DISTANCE,
     HEIGHT_CYCLES,

@@ -11,7 +11,7 @@ from simulated_robot import PERIOD, SimulatedRobot, only, row, signals
 from atalante_control.model import ExoskeletonParameters
 from atalante_hal.robot import IMUS
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility.finding import Signals
+from atalante_hal.safety.plausibility.signals import Signals
 from atalante_hal.safety.plausibility.trunk import TORSO_HEIGHT, Trunk
 
 TORSO, PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
