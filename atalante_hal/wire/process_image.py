@@ -689,16 +689,16 @@ class TransmitImage:
             The frame to send, shape (1,).
         """
         self.codec.encode(self.values, self.frames)
-        self.resume(row, int(self._counters[row]) + 1 & 0xFF)
+        self._counters[row] = self._counters[row] + 1 & 0xFF
         self._protect(self._octets, self._spans, self._counters)
         return self._singles[row]
 
-    def resume(self, row: int, counter: int) -> None:
-        """Set the counter of a row, so that the next frame continues the sequence of another sender.
+    def set_counter(self, row: int, counter: int) -> None:
+        """Set the last counter of a row. The next frame of the row has this counter plus 1; 0 follows 255.
 
         Args:
             row: row of the message.
-            counter: alive counter of the last frame of the other sender, 0 to 255.
+            counter: alive counter, 0 to 255.
         """
         self._counters[row] = counter
 

@@ -83,8 +83,8 @@ class Heartbeats:
         """
         status = self._of[node]
         status.booted = cycle
-        status.tx.resume(0, 0xFF)
-        self._emergencies.resume(self._emergencies.codec.rows[f"{node}_EMCY"], 0xFF)
+        status.tx.set_counter(0, 0xFF)
+        self._emergencies.set_counter(self._emergencies.codec.rows[f"{node}_EMCY"], 0xFF)
         self.set(node, "NodeState", BOOTUP)
         self.set(node, "ErrorFlags", 0.0)
         self._booting.append(status)

@@ -20,7 +20,7 @@ class FrameSource:
 
     def __call__(self, counter: int, torque: float = 0.0) -> Frames:
         self._tx.values[self._torque] = torque
-        self._tx.resume(0, (counter - 1) & 0xFF)
+        self._tx.set_counter(0, (counter - 1) & 0xFF)
         return self._tx.seal().copy()
 
 

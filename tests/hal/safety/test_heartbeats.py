@@ -93,7 +93,7 @@ def test_second_boot_up_is_reported_as_reset(nodes: Nodes):
 
 
 def test_boot_up_with_any_counter_is_reported_as_reset(running: Nodes):
-    running.tx.resume(running.tx.codec.rows["LEFT_SK_STATUS"], 100)
+    running.tx.set_counter(running.tx.codec.rows["LEFT_SK_STATUS"], 100)
     running.receive(running.frame("LEFT_SK", NodeState=0))
     assert running.evaluate() == {("NODE_RESET", "LEFT_SK"): True}
 
@@ -395,7 +395,7 @@ def test_unknown_frames_are_returned(running: Nodes):
 
 def test_restarted_sender_with_the_last_counter_is_accepted_and_reported(running: Nodes):
     row = running.tx.codec.rows["LEFT_SK_STATUS"]
-    running.tx.resume(row, int(running.tx.frames["data"][row, 2]) - 1 & 0xFF)
+    running.tx.set_counter(row, int(running.tx.frames["data"][row, 2]) - 1 & 0xFF)
     running.receive(running.frame("LEFT_SK", Uptime=9.0))
     assert running.heartbeats.quiet is False
     assert running.heartbeats.image.values[running.heartbeats.image.codec.index("LEFT_SK_STATUS", "Uptime")] == 9.0
@@ -406,7 +406,7 @@ def test_restarted_sender_with_the_last_counter_is_accepted_and_reported(running
 def test_emergency_with_the_last_counter_is_accepted(running: Nodes):
     row = running.tx.codec.rows["LEFT_SK_EMCY"]
     running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
-    running.tx.resume(row, int(running.tx.frames["data"][row, 2]) - 1 & 0xFF)
+    running.tx.set_counter(row, int(running.tx.frames["data"][row, 2]) - 1 & 0xFF)
     running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
     assert running.heartbeats.emergencies == {"LEFT_SK": (Dtc.OVER_TEMP, 0x4310)}
 
@@ -415,7 +415,7 @@ def test_two_senders_are_confirmed_at_the_fifth_conflict(running: Nodes):
     row = running.tx.codec.rows["HAPTICS_STATE"]
     for pair in range(1, 7):
         true = running.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
-        running.tx.resume(row, int(true["data"][0, 2]) - 1 & 0xFF)
+        running.tx.set_counter(row, int(true["data"][0, 2]) - 1 & 0xFF)
         running.receive(true, running.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5))
         assert not running.heartbeats.quiet
         assert running.evaluate() == {("NODE_DUPLICATE", "HAPTICS"): pair > 4}
@@ -434,7 +434,7 @@ def test_two_senders_are_confirmed_although_frames_of_another_node_are_damaged(r
         damaged = running.frame("LEFT_SK")
         damaged["data"][0, 5] ^= 1
         true = running.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
-        running.tx.resume(row, int(true["data"][0, 2]) - 1 & 0xFF)
+        running.tx.set_counter(row, int(true["data"][0, 2]) - 1 & 0xFF)
         running.receive(damaged, true, running.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5))
         assert running.evaluate()["NODE_DUPLICATE", "HAPTICS"] is (pair > 4)
 

@@ -619,10 +619,10 @@ def test_identifiers_are_expected_until_their_timeout():
     assert rx.expected_ages() == everybody
 
 
-def test_resume_continues_after_the_given_counter():
+def test_set_counter_continues_after_the_given_counter():
     tx = TransmitImage(CYCLIC)
     assert (tx.seal()["data"][:, 2] == 0).all()
-    tx.resume(2, 9)
+    tx.set_counter(2, 9)
     counters = tx.seal()["data"][:, 2]
     assert counters[2] == 10
     assert (np.delete(counters, 2) == 1).all()
