@@ -15,6 +15,7 @@ from atalante_tools.cli import cli
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial import command as trial_command
+from atalante_tools.trial import fault_run
 from atalante_tools.trial.fault_findings import NO_FALL, NO_FALL_IN_DOUBLE_SUPPORT, fault_findings
 from atalante_tools.trial.fault_plan import (
     DOUBLE_SUPPORT,
@@ -69,6 +70,7 @@ def test_bisection_returns_the_horizon_if_the_robot_never_falls() -> None:
     [
         ("F05", {}, False),
         ("F05", {"outcome": "hold"}, True),
+        ("F05", {"outcome": "unfinished"}, True),
         ("F56", {"case": "dead-man released"}, False),
         ("F56", {"case": "HOLD"}, True),
         ("F44", {"case": "3 cycles"}, False),
@@ -96,6 +98,20 @@ def test_finding_states_moment_state_diagnostic_and_reason_of_a_fall() -> None:
         "1 of 1 walks fell; a case: at phase 0.5 (HOLD; NODE_TIMEOUT; lost); "
         "longest duration without a fall 120 cycles (at phase 0.5)"
     )
+
+
+def test_finding_counts_unfinished_walks() -> None:
+    (finding,) = fault_findings([result("F22", outcome="unfinished")])
+    assert finding.statistic == "0 of 1 walks fell; 1 unfinished"
+
+
+@pytest.mark.long
+def test_walk_that_lasts_too_long_is_unfinished(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fault_run, "_LONGEST", 2000)
+    monkeypatch.setattr(fault_run, "_branches", fault_run._branches.__wrapped__)  # the cache must not keep this walk
+    (trial, *_) = fault_trials(("F05",), True, 0, "mujoco")
+    with pytest.raises(RuntimeError, match="must reach its end, got the outcome unfinished"):
+        run_fault(trial)
 
 
 def test_expected_diagnostic_is_found_among_information() -> None:

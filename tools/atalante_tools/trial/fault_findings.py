@@ -59,6 +59,8 @@ def _finding(id_: str, fault: str, results: Sequence[Result]) -> Finding:
     parts = [f"{len(falls)} of {len(runs)} walks fell"]
     parts += [f"{case}: {_moments(cases)}" for case, cases in _by_case(falls)]
     parts += [f"longest duration without a fall {_longest(result)}" for result in results if result["longest"]]
+    if unfinished := sum(one["outcome"] == "unfinished" for _, one in runs):
+        parts.append(f"{unfinished} unfinished")
     parts += [f"exception: {one['reason']}" for _, one in runs if one["outcome"] == "exception"]
     return Finding(id_, f"{fault}: {_claim(id_)}", "; ".join(parts), not failed)
 

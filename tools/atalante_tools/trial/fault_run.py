@@ -70,7 +70,8 @@ class FaultRun:
     """Result of one walk with a fault."""
 
     moment: str  # one of `FaultTrial.moments`
-    #: "walked" (two steps after the fault, or to the end), "hold" (stopped upright), "fell" or "exception"
+    #: "walked" (two steps after the fault, or to the end), "hold" (stopped upright), "fell", "exception", or "unfinished"
+    #: (after `_LONGEST` cycles, the robot is upright and the controller still drives the joints)
     outcome: str
     state: str  # state of the HAL at the end
     #: diagnostics since the first faulty cycle, in the order of their first report; the severity `info` is left out
@@ -333,7 +334,10 @@ class _Walk:
                 if walk.done or (walks_on and state.supervisor in WALKING):
                     self.outcome = "walked"
                     return True
-                return state.cycle > _LONGEST
+                if state.cycle > _LONGEST:
+                    self.outcome = "unfinished"
+                    return True
+                return False
             halted += started
             resting = resting + 1 if started and _still(emulator) else 0
             return resting > _RESTED or halted > AFTERMATH or state.cycle > _LONGEST

@@ -11,7 +11,13 @@ from typing import Any, Final
 from atalante_tools.trial.fault_plan import FURTHER_MOMENTS, MOMENTS
 
 #: Outcome of a walk -> word in the table.
-_WORDS: Final = {"walked": "walks", "hold": "stops", "fell": "FALLS", "exception": "ERROR"}
+_WORDS: Final = {
+    "walked": "walks",
+    "hold": "stops",
+    "fell": "FALLS",
+    "unfinished": "unfinished",
+    "exception": "ERROR",
+}
 
 
 def fault_table(results: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
