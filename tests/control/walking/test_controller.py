@@ -286,9 +286,9 @@ def test_stance_leg_replaces_both_lost_trunk_imus_until_they_return(lost: tuple[
     for missing, gyro in (("torso", "pelvis", *lost), 9.0), ((), rate * up):
         state.age[list(state.imu_rows)] = [11 if imu in missing else 10 for imu in IMUS]
         state.imu_gyro[trunk] = gyro
-        vertical = controller._observer.rotation[2].copy()
+        vertical = controller.vertical.copy()
         assert turn_during(controller, state, 100) == pytest.approx(0.1 * rate, abs=1e-3)
-        assert controller._observer.rotation[2] == pytest.approx(vertical, abs=1e-3)
+        assert controller.vertical == pytest.approx(vertical, abs=1e-3)
 
 
 @pytest.mark.long
@@ -352,7 +352,7 @@ def pushed(
     direction: float,
     force: float,
     edge: float = WalkConfig().edge,
-    check: Callable[[WalkController, State], None] | None = None,
+    check: Callable[[WalkController, State, Command], None] | None = None,
 ) -> bool:
     """Push the pelvis for 0.2 s from phase 0.2 of the second step; return whether the robot walks three more steps."""
     lean = LeanConfig() if math.isfinite(dead_zone) else LeanConfig(gain=0.0, leg_gain=0.0)
@@ -364,9 +364,9 @@ def pushed(
         hang(body, controller.standing_pose.tolist(), 0.0005)
         robot = Ideal(body)
         while controller.statistics.steps < 4 and robot.upright():
-            robot.cycle(controller)
+            command = robot.cycle(controller)
             if check is not None:
-                check(controller, robot.state)
+                check(controller, robot.state, command)
             steps, elapsed = controller.statistics.steps, elapsed_of(controller)
             if steps == 1 and controller.phase is Phase.STEP and elapsed >= 0.16 and cycles < 200:
                 body.push((force * math.cos(angle), force * math.sin(angle), 0.0))
@@ -390,12 +390,12 @@ def test_robot_withstands_a_push_only_with_foot_placement_step_timing_and_lean(d
 def test_ankle_of_a_pushed_robot_keeps_the_centre_of_pressure_within_the_sole() -> None:
     foot, arms = ExoskeletonParameters(), list[float]()
 
-    def store_arm(controller: WalkController, state: State) -> None:
+    def store_arm(controller: WalkController, state: State, command: Command) -> None:
         if controller.phase is Phase.STEP and elapsed_of(controller) > 0.1:
-            stance = controller._stance
+            stance = int(fields_of(controller)["stance"][0])
             force = float(state.foot_force[stance, :, 2].sum())
             if force > 1000.0:
-                arms.append(float(controller._command.torque[6 * stance + 4]) / force)
+                arms.append(float(command.torque[6 * stance + 4]) / force)
 
     edge = 0.06  # so large that the push moves the centre of pressure to the limit
     pushed(PlacementConfig().dead_zone, 180.0, 200.0, edge, store_arm)
