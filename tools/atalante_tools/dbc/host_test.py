@@ -115,8 +115,6 @@ def source(build: Build) -> str:
     messages = build.messages
     functions = "\n".join(_message(build, m, messages[(row + 1) % len(messages)]) for row, m in enumerate(messages))
     table = "\n".join(f"    {{ {_size(build, m)}u, test_{camel_to_snake_case(m.name)} }}," for m in messages)
-    magic = ", ".join(f"{byte:#04x}" for byte in MAGIC)
-    counters = ", ".join(str(int(check_counter(0, counter))) for counter in range(256))
     name = build.name
     return f"""\
 /**
@@ -157,6 +155,22 @@ static double next(const uint8_t **in_pp)
     return value;
 }}
 
+{_counter_check(name)}
+{functions}
+static const struct {{
+    size_t size;
+    void (*test)(const uint8_t *in_p);
+}} tests[] = {{
+{table}
+}};
+
+{_main(name)}"""
+
+
+def _counter_check(name: str) -> str:
+    """Return the C function that checks each counter that follows counter 0."""
+    counters = ", ".join(str(int(check_counter(0, counter))) for counter in range(256))
+    return f"""\
 /* Result of the Python check for each counter that follows counter 0. */
 static const uint8_t after_zero[256] = {{ {counters} }};
 
@@ -176,15 +190,13 @@ static void check_counters(void)
         EXPECT(receiver.counter == counter);
     }}
 }}
+"""
 
-{functions}
-static const struct {{
-    size_t size;
-    void (*test)(const uint8_t *in_p);
-}} tests[] = {{
-{table}
-}};
 
+def _main(name: str) -> str:
+    """Return the C function that reads the test vectors and tests each message of each image."""
+    magic = ", ".join(f"{byte:#04x}" for byte in MAGIC)
+    return f"""\
 int main(int argc, char **argv)
 {{
     static const uint8_t magic[8] = {{ {magic} }};
