@@ -12,7 +12,7 @@ import numpy as np
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, Frames, new_frames
 from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.node_tester import NodeTester, NotTested
-from atalante_tools.conform.requirement import Outcome, Requirement
+from atalante_tools.conform.requirement import E2E, Outcome, Requirement
 from atalante_tools.conform.technician import Action
 
 #: NMT states in the heartbeat (CiA 301).
@@ -36,16 +36,10 @@ _WRONG: Final = len(_DAMAGED)
 _LISTED: Final = 3
 
 
-def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requirement]]:
-    """Return the requirements for every node in two lists: requirements to test first, and requirements to test last.
-
-    The requirements in the first list are tested while the node is at rest. The requirements in the second list are
-    tested on all frames received in the examination. The requirements for the kind of the node, such as drive or IMU, are
-    tested after the first list and before the second list.
-    """
-    node, state = tester.node.name, tester.state_message
-    e2e = "AUTOSAR E2E Profile 5"
-    before = [
+def requirements_at_rest(tester: NodeTester) -> list[Requirement]:
+    """Return the requirements for every node that are tested while the node is at rest."""
+    state = tester.state_message
+    requirements = [
         Requirement(
             "NODE-01",
             "Sends one BOOTUP heartbeat after power-up, then OPERATIONAL.",
@@ -81,7 +75,7 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
         ),
     ]
     if state.cycle_ms == 1:
-        before += [
+        requirements += [
             Requirement(
                 "NODE-06",
                 "Sends no state frame without SYNC.",
@@ -93,14 +87,14 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
                 "NODE-07",
                 "Does not answer a SYNC with a wrong CRC.",
                 f"every second SYNC with one bit flipped, {_WRONG} times",
-                e2e,
+                E2E,
                 _ignores_sync(lambda b, i: b.sync_frame(flip=_DAMAGED[i])),
             ),
             Requirement(
                 "NODE-08",
                 "Does not answer a repeated SYNC.",
                 f"every second SYNC with the counter of the previous SYNC, {_WRONG} times",
-                e2e,
+                E2E,
                 _ignores_sync(lambda b, _: b.sync_frame(counter=b.sync.counter)),
             ),
             Requirement(
@@ -111,7 +105,7 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
                 _ignores_sync(_sync_of_another_length),
             ),
         ]
-    before.append(
+    requirements.append(
         Requirement(
             "NODE-10",
             "Answers every SYNC while frames with unknown identifiers are on the bus.",
@@ -120,20 +114,25 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
             tolerates_foreign_frames,
         )
     )
+    return requirements
+
+
+def requirements_on_all_frames(tester: NodeTester) -> list[Requirement]:
+    """Return the requirements for every node that are tested on all frames received in the examination."""
     all_frames = "all frames received in this examination"
-    after = [
+    return [
         Requirement(
             "NODE-11",
             "Increments each counter by 1 per frame; the counter of an answer to SYNC is the low byte of Cycle.",
             all_frames,
-            e2e,
+            E2E,
             _all(_counter_defects),
         ),
         Requirement(
             "NODE-12",
             "Protects every frame with a CRC over payload and Data ID.",
             all_frames,
-            e2e,
+            E2E,
             _all(_crc_defects),
         ),
         Requirement(
@@ -154,7 +153,7 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
             "NODE-15",
             "Sends every reserved bit as 0.",
             all_frames,
-            f"DBC layout of the messages of {node}",
+            f"DBC layout of the messages of {tester.node.name}",
             _all(
                 lambda received: [
                     f"{frame.message.name} in cycle {frame.cycle}" for frame in received if not frame.reserved_zero
@@ -169,7 +168,6 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
             stays_operational,
         ),
     ]
-    return before, after
 
 
 # -- start-up and heartbeat --------------------------------------------------------------------------------------------

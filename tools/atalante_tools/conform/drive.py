@@ -12,10 +12,9 @@ from atalante_tools.conform.axis import FOLLOW, LEGAL, ROUTES, STAY
 from atalante_tools.conform.drive_commands import LATCHED, TOLERATED, UNKNOWN, ignores
 from atalante_tools.conform.drive_states import STOP
 from atalante_tools.conform.node_tester import NodeTester
-from atalante_tools.conform.requirement import Requirement
+from atalante_tools.conform.requirement import E2E, Requirement
 
 CIA402: Final = "IEC 61800-7-201"
-E2E: Final = "AUTOSAR E2E Profile 5"
 
 
 def requirements(tester: NodeTester) -> list[Requirement]:

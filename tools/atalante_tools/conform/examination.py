@@ -23,7 +23,7 @@ def requirements_of(tester: NodeTester) -> list[Requirement]:
     The requirements at start-up and at rest come first. The requirements for the kind of the node, such as drive or IMU,
     come next. The requirements for all received frames come last.
     """
-    before, after = any_node.requirements(tester)
+    before, after = any_node.requirements_at_rest(tester), any_node.requirements_on_all_frames(tester)
     special = _REQUIREMENTS[tester.node.kind](tester)
     # DRIVE-01 tests the state after start-up, so it must run before the first command.
     early = 1 if tester.node.kind == "drive" else 0

@@ -14,9 +14,8 @@ from atalante_hal.types import Vector
 from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.node_tester import NodeTester, NotTested
-from atalante_tools.conform.requirement import Outcome, Requirement
+from atalante_tools.conform.requirement import E2E, Outcome, Requirement
 
-E2E: Final = "AUTOSAR E2E Profile 5"
 #: A motor fails the test HAPTICS-02 if its time constant is larger than this time [s].
 TIME_CONSTANT = 0.06
 #: Amplitudes and levels are numbers from 0 (off) to 1 (strongest).

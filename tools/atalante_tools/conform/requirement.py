@@ -13,6 +13,8 @@ from atalante_tools.conform.node_tester import NodeTester, NotTested
 LATE: Final = 2e-3
 #: If a test fails this number of times while this computer is late, the verdict is "not tested".
 ATTEMPTS: Final = 3
+#: Standard of the counter and the CRC, for the text of the requirements.
+E2E: Final = "AUTOSAR E2E Profile 5"
 
 
 class Verdict(Enum):
