@@ -257,6 +257,7 @@ class AirwalkController:
         """
         cycle = state.cycle - self._changed_at
         self._command.late = False
+        self._loop_delay.stays_uncovered(state)
         if self._walking:
             if step_over(cycle, self._cycles):
                 if self._stance == RIGHT:
@@ -305,11 +306,12 @@ class AirwalkController:
         self._changed_at, self._stance = state.cycle, stance
         self._command.step = (self._command.step or 0) + 1
         xi = min(1.0, max(0.0, state.assistance_factor))
-        if xi < 1.0 and not self._loop_delay.is_covered(state):
+        if xi < 1.0 and self._loop_delay.confirmed:
             self._command.late, xi = True, 1.0
             self.statistics.late += 1
+        else:  # The factor 1 of a late step is no choice of the operator.
+            self.statistics.factors.add(xi)
         self._assisting = xi < 1.0
-        self.statistics.factors.add(xi)
         leg = _LEG * (1 - stance)
         hip, knee = leg + _SH, leg + _SK
         self._share.fill(1.0)

@@ -14,7 +14,8 @@ from atalante_hal.types import State
 
 #: Largest additional delay that the certificate of a guide covers [cycles].
 COVERED: Final = DELAYS[1] - DELAYS[0]
-#: The delay stays uncovered after this number of consecutive cycles. Single lost frames also make the data old, but are harmless.
+#: The delay counts as uncovered for good after this number of consecutive cycles. Single lost frames also make the data old, but
+#: are harmless. The HAL tolerates the loss of up to a fifth of the frames.
 _CONFIRM: Final = 5
 #: Indices in JOINTS of the joints with a guide: sagittal hip and knee of both legs.
 _GUIDED: Final = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SH", "SK")]
@@ -37,7 +38,8 @@ class LoopDelay:
         Args:
             state: measured state of the robot after START.
         """
-        self._at_start, self._uncovered = max(0, state.delay - _oldest(state)), 0
+        self._at_start = max(0, state.delay - _oldest(state))
+        self._uncovered = 0 if self.is_covered(state) else _CONFIRM
 
     def is_covered(self, state: State) -> bool:
         """Return whether the certificate of a guide covers the delay of this cycle.
@@ -50,10 +52,17 @@ class LoopDelay:
     def stays_uncovered(self, state: State) -> bool:
         """Count one cycle, and return whether the delay has been uncovered in several consecutive cycles.
 
+        Call this in every cycle, also without a guide. Otherwise the counted cycles would not be consecutive.
+
         Args:
             state: measured state of the robot.
         """
         self._uncovered = 0 if self.is_covered(state) else self._uncovered + 1
+        return self.confirmed
+
+    @property
+    def confirmed(self) -> bool:
+        """Return whether the delay was uncovered in several consecutive cycles up to the last counted cycle."""
         return self._uncovered >= _CONFIRM
 
 

@@ -375,14 +375,15 @@ class WalkController:
             self.stop()
         cycle = state.cycle - self._since
         following = next_phase(self.phase, self._facts(cycle))
-        self._command.late = False
+        self._command.late, late = False, self._loop_delay.stays_uncovered(state)
         if following is not None:
             self._begin(following, state)
             cycle = 0
             self._torque_before[:] = self._measured.sent
-        elif self._assisted and cycle <= self._stage.last_guided and self._loop_delay.stays_uncovered(state):
+        elif late and self._assisted and cycle <= self._stage.last_guided:
             self._command.late, self._stage.last_guided = True, cycle - 1
             self.statistics.guide.late += 1
+            self._clear_guide_record()
         self._act(
             cycle, self._measured, self._table, self._constants, self._stabiliser, self._section.assistance, self._parts
         )
@@ -561,7 +562,7 @@ class WalkController:
         stage.literal = self.config.literal_law and phase is Phase.STEP
         self._pid.limit_integral(math.inf if stage.literal else self.config.gains.integral_limit)
         guided = phase is Phase.STEP and state.assistance_factor < 1.0 and steps >= self._section.guided
-        self._command.late = guided and not self._loop_delay.is_covered(state)
+        self._command.late = guided and self._loop_delay.confirmed
         self.statistics.guide.late += self._command.late
         self._assisted = stage.assisted = guided and not self._command.late
         stage.last_guided = len(self._section.assistance.unmodelled) - 1
@@ -574,8 +575,7 @@ class WalkController:
     def _start_guide(self, xi: float) -> None:
         """Start the guide of a step."""
         stage, record, statistics = self._stage, self._record, self.statistics.guide
-        record.assistance_factor, record.gate, record.h = 1.0, 0.0, 1.0
-        record.error[:], record.q_bound[:] = 0.0, 0.0
+        self._clear_guide_record()
         self._command.vibration.fill(0.0)
         self._promised = False
         if not self._assisted:
@@ -587,6 +587,12 @@ class WalkController:
         self._start_deviation, self._promised = (angles, rates), promise > 0.0
         statistics.factors.add(xi)
         record.assistance_factor, stage.intensity = xi, intensity(xi)
+
+    def _clear_guide_record(self) -> None:
+        """Write the values of a motion without a guide into the telemetry."""
+        record = self._record
+        record.assistance_factor, record.gate, record.h = 1.0, 0.0, 1.0
+        record.error[:], record.q_bound[:] = 0.0, 0.0
 
     def _watch_guide(self, cycle: int) -> None:
         """Update the statistics of the guide, and set three flags of the command: `outside`, `guide_left`, `hand_over_exceeded`.

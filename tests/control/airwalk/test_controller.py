@@ -153,6 +153,31 @@ def test_statistics_contain_the_assistance_factors_of_the_steps():
     assert controller.statistics.factors == {0.5, 0.95}
 
 
+@pytest.mark.parametrize(
+    ("delay", "period", "late"),
+    [
+        (2, 0, [0, 1, 2]),  # the loop is 2 ms slower at START
+        (0, 0, [2]),  # the data of a knee becomes 2 cycles old in the second step
+        (0, 5, []),  # every fifth frame arrives in time: lost frames, but no delay
+    ],
+)
+def test_step_has_no_guide_if_the_loop_is_slower_than_the_guide_covers(delay: int, period: int, late: list[int]):
+    controller, plant = airwalk(), Plant(xi=0.5)
+    state, found = plant.state, []
+    state.delay, state.joint_rows = delay, tuple(range(12))
+    controller.reset(state)
+    for cycle in range(STARTUP + 2 * STEP + 10):
+        state.age[SK] = 2 if (cycle % period if period else cycle > STARTUP + STEP) else 0
+        command = controller.update(state)
+        if command.late:
+            found.append((cycle - STARTUP) // STEP)
+            assert (cycle - STARTUP) % STEP == 0
+        plant.step(command.torque.copy())
+    assert found == late
+    assert controller.statistics.late == len(late)
+    assert controller.statistics.factors == (set() if delay else {0.5})
+
+
 def test_integral_does_not_wind_up_when_the_limiter_cuts_the_torque():
     controllers = airwalk(), airwalk()
     joint, commands = JOINTS.index("right_FH"), []

@@ -61,3 +61,26 @@ def test_state_without_rows_of_the_joints_counts_as_new() -> None:
     state = state_with(0, {"left_SK": 4})
     state.joint_rows = ()
     assert LoopDelay().is_covered(state)
+
+
+def test_delay_that_is_uncovered_at_start_needs_no_further_cycles() -> None:
+    loop, slow = LoopDelay(), state_with(2, {})
+    loop.reset(slow)
+    assert loop.confirmed
+    assert loop.stays_uncovered(slow)
+    loop.reset(state_with(1, {}))
+    assert not loop.confirmed
+
+
+@pytest.mark.parametrize(("delay", "loss"), [(0, 0.1), (1, 0.01)])
+def test_lost_frames_that_the_hal_tolerates_do_not_confirm_a_delay(delay: int, loss: float) -> None:
+    """Two frames of a joint in a row, or one frame in a loop that is 1 ms slower, are often lost at the start of a step."""
+    loop, state, rng = LoopDelay(), state_with(delay, {}), np.random.default_rng(0)
+    loop.reset(state)
+    rows, uncovered, confirmed = np.array(ROWS), 0, 0
+    for _ in range(20000):
+        state.age[rows] = np.where(rng.random(len(rows)) < loss, state.age[rows] + 1, 0)
+        uncovered += not loop.is_covered(state)
+        confirmed += loop.stays_uncovered(state)
+    assert uncovered > 500
+    assert confirmed < 10

@@ -593,8 +593,41 @@ def test_guide_ends_within_the_step_if_data_becomes_late() -> None:
     assert second == 0.0
 
 
+def test_telemetry_shows_no_guide_after_the_guide_ended_within_the_step() -> None:
+    controller, ended = WalkController(ROBOT, PATIENT, WALK, 1), []
+
+    def watch(state: State, command: Command) -> None:
+        shown = fields_of(controller)
+        if command.late or (ended and controller.phase is Phase.STEP):
+            ended.append(
+                (shown["assistance_factor"].item(), *shown["q_bound"], *shown["error"], shown["lambda"].item())
+            )
+            assert not command.vibration.any()
+
+    walk_in_guide(controller, late_from=0.4, watch=watch)
+    assert len(ended) > 400
+    assert set(ended) == {(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
+
+
+def test_frames_lost_at_the_start_of_a_step_do_not_prevent_its_guide() -> None:
+    """Only every fifth frame of a knee arrives in time. So at most stance changes, the data is older than the guide covers."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 2)
+
+    def watch(state: State, command: Command) -> None:
+        state.age[state.joint_rows[KNEES[0]]] = 2 if state.cycle % 5 else 0
+
+    late = walk_in_guide(controller, watch=watch)
+    assert not late
+    assert controller.statistics.guide.late == 0
+    assert controller.statistics.guide.cycles > 2 * 700
+
+
 def walk_in_guide(
-    controller: WalkController, *, delay: int = 0, late_from: float | None = None
+    controller: WalkController,
+    *,
+    delay: int = 0,
+    late_from: float | None = None,
+    watch: Callable[[State, Command], None] = lambda state, command: None,
 ) -> list[tuple[float, float]]:
     """Walk in a guide to standing. Return when the command was late: phase of the step, and largest change of a knee torque [Nm].
 
@@ -602,6 +635,7 @@ def walk_in_guide(
         controller: controller of the walk.
         delay: delay of the torques that the HAL measured at START [cycles].
         late_from: phase of the first step from which on the data of both knees is 3 cycles old. None if it is always new.
+        watch: function called after each cycle with state and command.
     """
     body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
     try:
@@ -618,6 +652,7 @@ def walk_in_guide(
                 jump = np.abs(command.torque - before)[KNEES].max()
                 late.append((fields_of(controller)["elapsed"].item() / WALK.step.duration, float(jump)))
             before[:] = command.torque
+            watch(state, command)
             assert robot.upright()
     finally:
         body.close()
