@@ -250,7 +250,7 @@ def _client(address: str) -> Iterator[Any]:
         raise FanOutError("--dask needs dask: install it with `pip install 'atalante-hal[dask]'`") from error
     try:
         client = Client(address, timeout=_CONNECT_TIMEOUT)  # type: ignore[no-untyped-call]
-    except (OSError, TimeoutError, ValueError) as error:
+    except (OSError, TimeoutError, TypeError, ValueError) as error:  # TypeError: no certificate of tls://
         raise FanOutError(
             f"no dask scheduler responds at {address} ({error}): start one with `dask scheduler`"
         ) from error

@@ -214,6 +214,8 @@ def test_call_that_ends_every_worker_gives_one_sentence() -> None:
 def test_missing_dependency_error_contains_the_command_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FanOutError, match="start one with `dask scheduler`"):
         list(fan_out(doubled, [1], cluster="not an address"))
+    with pytest.raises(FanOutError, match=r"at tls://127.0.0.1:1 .*start one with `dask scheduler`"):
+        list(fan_out(doubled, [1], cluster="tls://127.0.0.1:1"))
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(FanOutError, match=r"pip install 'atalante-hal\[dask\]'"):
         list(fan_out(doubled, [1], cluster="tcp://127.0.0.1:1"))
