@@ -178,7 +178,7 @@ class DirectionProof:
         self.failed: list[int] = []
         self.running = False
         self._anchor, self._base, self._sign = np.zeros((3, len(JOINTS)))
-        #: Tests still to be done: indices in JOINTS of the tested joints, and duration of the pulse [cycles].
+        #: Remaining tests. For each test: joints to test, as indices in JOINTS, and duration of the pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
         # Extra delay [cycles], measured in tests with a short pulse and more than two joints. Tests of one or two joints use it.

@@ -28,7 +28,8 @@ from atalante_hal.types import Vector
 
 #: Longest time from sending a torque to the report of this torque by the drive [cycles].
 #: `SPAN` is the sum of 4 cycles with lost commands, a delay of the drive's frame of 4 cycles, and 4 cycles without faults.
-#: Without faults, the drive applies a command one cycle after it was sent, follows it within two, and reports one cycle later.
+#: Without faults, the drive applies a command one cycle after the HAL sent it. The torque follows within two more cycles, and
+#: the drive reports it in the next cycle.
 SPAN: Final = 12
 #: A reported torque may lie outside the range of the last sent torques (smallest to largest) by this tolerance.
 #: The tolerance is a fraction of the breakaway torque of the joint.

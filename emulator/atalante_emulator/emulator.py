@@ -181,7 +181,7 @@ class Emulator:
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
-        self._shares: list[Frames] = []  # _shares[i]: frames that the nodes send after SYNC i, on the bus of SYNC i
+        self._shares: list[Frames] = []  # _shares[i]: frames with which the nodes of bus i answer the SYNC of bus i
         for sync in syncs:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])

@@ -23,7 +23,7 @@ from atalante_hal.safety.plausibility.signals import Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive samples with a tilted sole after which an ankle encoder is reported. A foot is sampled every 32 cycles.
-#: A sample shows a tilted sole if the forces are those of a flat foot, but ankle encoders and tibia IMU give a tilted sole.
+#: The sole counts as tilted if the force cells show a flat foot, but ankle encoders and tibia IMU show a tilt.
 SOLE_SAMPLES = 4
 #: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free` (largest force of an unloaded cell).
 _LOAD = 4.0

@@ -72,7 +72,7 @@ class StepGuides:
             overlap=overlap,
         )
         phases = leg.time / leg.time[len(leg.time) - 1 - overlap]
-        # All shapes of the package are at most as wide as `half_width(0)`, so they share their predictions.
+        # The predictions depend on the width only if a shape is wider than `half_width(0)`, and no shape of the package is wider.
         widest = max(half_width(0.0), float(shape.bounds(phases, 0.0).max()))
         self.filters = [
             GuideFilter(limits, shape, prediction_of(policy, leg, assumptions, blend, widest), blend)

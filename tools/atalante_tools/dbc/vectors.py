@@ -80,7 +80,7 @@ class Vectors:
         return np.where(exact & (code < plan[HIGH]), value, self._minimum)
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the order of the bytes of an image in the stream, as an index array.
+        """Return the index array `order` that sorts the bytes of an image into the order of the stream.
 
         An image is a set of payloads, one payload per message.
         The method `images` joins one array per kind of data, such as all payloads and all signal values. The stream has the

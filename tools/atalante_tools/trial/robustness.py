@@ -98,7 +98,7 @@ def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, 
 
 
 def _parameters(trial: RobustTrial) -> EmulatorParameters:
-    """Return the parameters of a robot on the ground whose motors follow a new torque `trial.delay[2]` cycles late."""
+    """Return the parameters of a robot on the ground whose motors produce each torque with a delay of `trial.delay[2]` cycles."""
     drive = replace(GROUND_PARAMETERS.drive, motor=MotorParameters(dead_time=trial.delay[2]))
     return replace(GROUND_PARAMETERS, drive=drive)
 

@@ -58,7 +58,7 @@ _SAMPLING = 20  # cycles between two samples of the motion
 _CURVES: Final = 15
 #: Edges of the bins in a histogram of e / q_bound: the angle error of a joint, divided by the half-width of the guide.
 EDGES: Final = tuple(round(-1.0 + 0.05 * k, 2) for k in range(41))
-#: Names of the three parts of a walk, with full assistance, with changing assistance factor, and with the factor of the trial.
+#: Names of the three parts of a walk: full assistance, changing assistance factor, and assistance factor of the trial.
 SEGMENTS: Final = ("full", "transition", "target")
 
 

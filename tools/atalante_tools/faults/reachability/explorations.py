@@ -283,11 +283,11 @@ def _contents(before: Reception, age: int) -> Iterator[PendantFrame]:
 def _agrees(frame: PendantFrame, operator: Operator) -> bool:
     """Return whether the pendant can have sent a frame with this content.
 
-    A frame that the pendant sampled after the operator's stop action must report the action. An earlier frame may have any
-    content.
+    If the pendant read its switches after the operator's stop action, its frame must report the action. An earlier frame may have
+    any content.
     """
     if frame.age > operator.cycles:
-        return True  # the pendant sampled the frame before the stop action
+        return True  # the pendant read its switches before the stop action
     return {
         NOTHING: True,
         RELEASED: not frame.dead_man,

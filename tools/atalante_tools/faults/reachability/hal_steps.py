@@ -44,7 +44,7 @@ NO_START, LAST_START, START = 0, 1, 2
 #: `NO_START`, `LAST_START` or `START` -> number of cycles in which a pressed START can still change the supervisor state.
 #: The search writes the number from `START_CYCLES` into `SafetyMonitor.start_cycles_left`.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
-#: Whether the HAL trusts the pendant -> error counters of the pendant (`Qualification`) that the search tries.
+#: Error counters of the pendant (`Qualification`) that the search tries. Key: True if the HAL trusts the pendant.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, 0, True)),
