@@ -177,10 +177,9 @@ class Transceiver:
         except BusError as error:
             self._report_down(error, 0.0 if cycle is None else patience)
         else:
+            self._log(first, count)
             if cycle is not None and (first or not cycle.begins(scratch, count)):
                 count = self._receive_rest(first, count, cycle, patience)
-        if self.tap is not None:
-            self.tap.received(scratch[first:] if first else scratch, count - first)
         if count > self._most:
             self._find(Dtc.BUS_FLOOD, self._floods + 1 >= PERSISTENT, count, "")
         return count
@@ -300,6 +299,11 @@ class Transceiver:
         self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
         time.sleep(min(patience, _DOUBTFUL_PATIENCE))
 
+    def _log(self, first: int, count: int) -> None:
+        """Pass the frames `scratch[first:count]` to the tap. The next `bus.receive` overwrites their times in `bus.stamps`."""
+        if self.tap is not None and count > first:
+            self.tap.received(self.scratch[first:] if first else self.scratch, count - first)
+
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:
         self._found.append(Finding(dtc, self._node, value, confirmed, text))
         self.quiet = False
@@ -335,6 +339,7 @@ class Transceiver:
             if got == 0:
                 break
             count += got
+            self._log(first, count)
         return count
 
 

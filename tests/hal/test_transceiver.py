@@ -365,6 +365,13 @@ def test_frames_received_before_an_error_of_the_bus_are_kept_and_logged(desk: De
     assert desk.evaluate() == {"BUS_DOWN": True}
 
 
+def test_frames_are_logged_while_the_bus_has_their_time_stamps(desk: Desk):
+    """On a real bus, the answers to a SYNC arrive one after another, and each call of the bus overwrites `stamps`."""
+    desk.bus.arrivals = [ids(9), ids(CYCLIC[0].frame_id, 8), ids(CYCLIC[1].frame_id)]
+    assert desk.transceiver.receive(0, image(0, 1), 0.01) == 4
+    assert desk.tap.received_ids == [[9], [CYCLIC[0].frame_id, 8], [CYCLIC[1].frame_id]]
+
+
 @pytest.mark.parametrize(
     ("can_id", "code", "value"),
     [
