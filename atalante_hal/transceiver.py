@@ -175,7 +175,9 @@ class Transceiver:
         try:
             count += self.bus.receive(scratch[first:] if first else scratch)
         except BusError as error:
-            self._report_down(error, 0.0 if cycle is None else patience)
+            self._report_down(error)
+            if cycle is not None:  # The answers on the other channels of a `JoinedBus` have not arrived yet.
+                count = self._receive_rest(first, count, cycle, min(patience, _DOUBTFUL_PATIENCE))
         else:
             self._log(first, count)
             if cycle is not None and (first or not cycle.begins(scratch, count)):
@@ -294,10 +296,10 @@ class Transceiver:
         if full is not error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
 
-    def _report_down(self, error: BusError, patience: float) -> None:
-        """Report an error of `receive`, and pause. Without a pause, lock-step cycles on a failing bus would run too fast."""
-        self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
-        time.sleep(min(patience, _DOUBTFUL_PATIENCE))
+    def _report_down(self, error: BusError) -> None:
+        """Report an error of `receive`, once per cycle."""
+        if all(finding.text != str(error) for finding in self._found):
+            self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
 
     def _log(self, first: int, count: int) -> None:
         """Pass the frames `scratch[first:count]` to the tap. The next `bus.receive` overwrites their times in `bus.stamps`."""
@@ -334,7 +336,9 @@ class Transceiver:
             try:
                 got = self.bus.receive(self.scratch[count:], remaining)
             except BusError as error:
-                self._report_down(error, patience)
+                self._report_down(error)
+                # Without a pause, lock-step cycles on a failing bus would run too fast.
+                time.sleep(max(0.0, min(begun + patience - time.monotonic(), _DOUBTFUL_PATIENCE)))
                 break
             if got == 0:
                 break

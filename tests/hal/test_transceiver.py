@@ -365,6 +365,27 @@ def test_frames_received_before_an_error_of_the_bus_are_kept_and_logged(desk: De
     assert desk.evaluate() == {"BUS_DOWN": True}
 
 
+def test_answers_of_the_other_channels_are_awaited_after_an_error_of_one_channel(desk: Desk):
+    """A removed adapter raises the error in every call without other frames, so also before the first answer to a SYNC."""
+    desk.bus.arrivals, begun = [BusDown("gone"), ids(CYCLIC[0].frame_id), BusDown("gone")], desk.bus.clock.now
+    assert desk.transceiver.receive(0, image(0, 1), 0.01) == 1
+    assert desk.bus.clock.now == begun + 0.01
+    assert len(desk.transceiver.faults()) == 1
+
+
+def test_error_after_the_whole_wait_causes_no_pause(desk: Desk):
+    """Otherwise a cycle on the wall clock would take longer than its period."""
+
+    def wait(frames: Frames, timeout: float = 0.0) -> int:
+        desk.bus.clock.now += timeout
+        raise BusDown("gone")
+
+    desk.bus.receive = wait
+    begun = desk.bus.clock.now
+    assert desk.transceiver.receive(0, image(0, 1), 0.01) == 0
+    assert desk.bus.clock.now == begun + 0.01
+
+
 def test_frames_are_logged_while_the_bus_has_their_time_stamps(desk: Desk):
     """On a real bus, the answers to a SYNC arrive one after another, and each call of the bus overwrites `stamps`."""
     desk.bus.arrivals = [ids(9), ids(CYCLIC[0].frame_id, 8), ids(CYCLIC[1].frame_id)]
