@@ -622,6 +622,20 @@ def test_frames_lost_at_the_start_of_a_step_do_not_prevent_its_guide() -> None:
     assert controller.statistics.guide.cycles > 2 * 700
 
 
+def test_end_of_a_guide_does_not_shorten_the_guide_of_the_next_step() -> None:
+    """In the second step, the data is old in one cycle only. The late cycles of the first step do not count any more."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 2)
+
+    def watch(state: State, command: Command) -> None:
+        elapsed = fields_of(controller)["elapsed"].item() / WALK.step.duration
+        first, second = (controller.phase is Phase.STEP and controller.statistics.steps == step for step in (0, 1))
+        old = (first and 0.4 <= elapsed < 0.42) or (second and elapsed == 0.0)
+        state.age[state.joint_rows[KNEES[0]]] = 2 if old else 0
+
+    assert len(walk_in_guide(controller, watch=watch)) == 1
+    assert controller.statistics.guide.late == 1
+
+
 def walk_in_guide(
     controller: WalkController,
     *,
