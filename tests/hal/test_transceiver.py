@@ -373,6 +373,19 @@ def test_answers_of_the_other_channels_are_awaited_after_an_error_of_one_channel
     assert len(desk.transceiver.faults()) == 1
 
 
+def test_frame_of_an_earlier_call_is_no_answer_after_an_error_of_one_channel(desk: Desk):
+    answer = ids(CYCLIC[0].frame_id)
+    desk.transceiver.scratch[0] = answer[0]
+    desk.bus.arrivals = [BusDown("gone"), answer]
+    assert desk.transceiver.receive(1, image(0), 0.01) == 2
+
+
+def test_call_without_frames_logs_nothing(desk: Desk):
+    desk.bus.arrivals = []
+    assert desk.transceiver.receive() == 0
+    assert desk.tap.received_ids == []
+
+
 def test_error_after_the_whole_wait_causes_no_pause(desk: Desk):
     """Otherwise a cycle on the wall clock would take longer than its period."""
 
