@@ -91,7 +91,7 @@ class Tolerances(NamedTuple):
 
 
 class Deviations(NamedTuple):
-    """Current deviation of each joint between its produced and its sent torque."""
+    """Record of the deviations of produced torques from sent torques, for each joint."""
 
     #: Sums of 1, t, e, t*t, t*e and e*e over the added checks of the deviation, with the sent torque t and the produced torque e.
     #: Shape (2, 12, 6), for each factor of `DECAY` and each joint. Older checks count less, see `DECAY`.

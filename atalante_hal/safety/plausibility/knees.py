@@ -61,7 +61,7 @@ _SETTLING_TIME = 2.0
 _LEAST_LEVER = 0.007
 #: An error of a knee angle is reported only if it explains more than this share of the mean square of v in `knee_error`.
 #: v in `knee_error` is the filtered difference between the measured and the computed position of the tibia IMU.
-#: v does not contain the part of this position difference that wrong segment lengths explain.
+#: Wrong segment lengths cause such a difference, too. This part is subtracted from v.
 _SHARE = 0.25
 #: Number of low-passes for each axis of a leg.
 _FILTERS = 11

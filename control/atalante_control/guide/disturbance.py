@@ -249,7 +249,7 @@ class Effect(NamedTuple):
     #: The change is for the error of the start velocity that an acceleration of 1 rad/s2 causes.
     #: An empty array of shape (0, 2, 2) means that the start velocity is assumed to be exact.
     hidden: Vector
-    #: (n, 2, 2) left[k]: matrix that converts `pushed` and `hidden` to the quantity in cycle k of the step.
+    #: Shape (n, 2, 2). The changes of the quantity in cycle k of the step are left[k] @ pushed[i] and left[k] @ hidden[i].
     #: For a torque or a torque change, left[k] is the mass matrix [kg m2]. For an error or a speed, left[k] is the unit matrix.
     left: Vector
 

@@ -128,7 +128,7 @@ class Assistance(NamedTuple):
     #: (n + 1, 2) Nm, torques of hip and knee that carry the patient's leg and compensate the pelvis motion. Row: cycle.
     #: `_assist` adds these torques to the gravity torques of the exoskeleton, unless `Stage.literal` is True.
     unmodelled: Vector
-    #: (m,) weights from 1 to 0 that fade out `Stage.excess`. Row: cycle after the last cycle with the guide.
+    #: (m,) weights from 1 to 0 that fade out `Stage.excess`. Row k: k cycles after the last cycle with the guide.
     fade: Vector
 
 

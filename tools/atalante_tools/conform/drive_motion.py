@@ -16,8 +16,8 @@ WINDOW: Final = 50
 #: The ratio of integral and position change may differ from 1 by at most this number. A filter of the velocity has a small
 #: effect on the ratio, because it delays the integral and does not scale it.
 RATIO: Final = 0.2
-#: A motion is compared only if its root mean square over all windows is at least this angle at the motor [rad]. The rounding
-#: of the velocity to its DBC step changes the integral over a window by at most a twentieth of this angle.
+#: A motion is compared only if its root mean square over all windows is at least this angle at the motor [rad]. The velocity is
+#: rounded to the resolution of its signal. The rounding error of the integral over a window is at most a twentieth of this angle.
 MOTION: Final = 0.01
 
 

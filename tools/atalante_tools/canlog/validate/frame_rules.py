@@ -34,7 +34,7 @@ _RECORDER = 0.99
 class Sorted:
     """Result of the header check: frames that can be decoded, and rejected frames."""
 
-    good: Indices | None  # position in the chunk of each frame that can be decoded; None means all positions
+    good: Indices | None  # indices of the frames of the chunk that can be decoded; None means all frames
     rejected_rows: Rows  # message index (position in the arrays of `Plan`) of each rejected frame, shape (k,)
     rejected_indices: Indices  # position of each rejected frame in the chunk, shape (k,)
 

@@ -28,8 +28,8 @@ PAUSE_NS: Final = 200_000_000
 #: Largest plausible increase of the cycle number from one SYNC to the next. A larger increase or a decrease counts as 1.
 #: A restart of the HAL or a damaged SYNC frame makes the cycle number jump, so the increase is then not plausible.
 MOST_STEPS: Final = 1000
-#: The new stamps of consecutive frames in a cycle are `_SPACING_NS` apart [ns]: 0 for SYNC, then 1000, 2000 and so on.
-#: The largest new stamp in a cycle is `_LAST` times the cycle time, counted from SYNC.
+#: The frames of a cycle get new time stamps at intervals of `_SPACING_NS` [ns]: 0 for SYNC, then 1000, 2000 and so on.
+#: No frame of a cycle gets a time stamp later than `_LAST` times the cycle time after SYNC.
 _SPACING_NS, _LAST = 1000, 0.7
 
 
