@@ -181,7 +181,7 @@ class DirectionProof:
         #: Remaining tests. For each test: joints to test, as indices in JOINTS, and duration of the pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # Extra delay [cycles], measured in tests with a short pulse and more than two joints. Tests of one or two joints use it.
+        # Extra delay [cycles], measured with a short pulse on more than two joints. Tests of one or two joints use this value.
         # Reason: a delay fitted to only one or two joints might make a motor with a wrong sign look like a late motor.
         self.late = 0
         #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.

@@ -52,8 +52,8 @@ AWAY: Final = math.radians(1.0)
 SUNK: Final = math.radians(3.0)
 #: A drive without torque reports less than this share of its torque limit.
 POWERLESS: Final = 0.1
-#: If encoder and IMUs of a joint differ by more than this angle [rad], the encoder may be wrong.
-#: If its encoder may be wrong, a drive is not reported as a drive without torque, because the joint may not have moved.
+#: If encoder and IMUs of a joint differ by more than this angle [rad], the encoder may be wrong, so the joint may not have
+#: moved. Then its drive is not reported as a drive without torque.
 ENCODER_ERROR: Final = math.radians(1.0)
 #: The count of faulty cycles restarts if the joint moves back or slows down, because its drive then works.
 #: - Moves back: the joint moves towards the position in which the hold began, faster than `SLOWER` [rad/s].

@@ -220,7 +220,7 @@ class Service:
             self._mark_saved()
 
     def _mark_saved(self) -> None:
-        """Report all records processed so far as saved, so that `RingWriter.kept` includes them."""
+        """Report that all handled records are saved, so that `RingWriter.kept` includes them."""
         self._records.keep(self._handled - self._kept)
         self._kept = self._handled
 

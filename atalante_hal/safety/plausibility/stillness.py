@@ -111,8 +111,8 @@ class Stillness:
         where = measured(codec)
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
-        #: Age of the values in the last sample [cycles], by row in the process image.
-        #: A message has newer values than its last sample if its current age (`_age`) is below `_sampled_age`.
+        #: Present age of the values in the last sample [cycles], by row in the process image. It grows with each call.
+        #: If the age of the message (`_age`) is lower, newer values have arrived since the last sample.
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)

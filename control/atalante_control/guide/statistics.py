@@ -21,7 +21,7 @@ class GuideStatistics:
     #: Number of compared steps that start outside the hand-over box (`HandOver`). The certificate does not apply to them.
     hand_overs_exceeded: int = 0
     late: int = 0  # number of steps whose guide did not act, or not to the end, because of the delay of the loop
-    #: Assistance factors of all steps so far. A step without a guide because of the delay of the loop (`late`) adds no factor.
+    #: Assistance factors of all steps so far. A step that has no guide because the loop is late (`late`) adds no factor.
     factors: set[float] = field(default_factory=set)
 
     @property
