@@ -17,8 +17,8 @@ COVERED: Final = DELAYS[1] - DELAYS[0]
 #: The delay counts as uncovered for good after this number of consecutive cycles. Single lost frames also make the data old, but
 #: are harmless. The HAL tolerates the loss of up to a fifth of the frames.
 _CONFIRM: Final = 5
-#: Indices in JOINTS of the joints with a guide: sagittal hip and knee of both legs.
-_GUIDED: Final = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SH", "SK")]
+# Indices in JOINTS of the joints with a guide: sagittal hip and knee of both legs.
+_LEFT_SH, _LEFT_SK, _RIGHT_SH, _RIGHT_SK = (JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SH", "SK"))
 
 
 class LoopDelay:
@@ -68,5 +68,7 @@ class LoopDelay:
 
 def _oldest(state: State) -> int:
     """Return the largest age of the data of the guided joints [cycles]; 0 if the ages are unknown."""
-    rows, age = state.joint_rows, state.age
-    return max(age.item(rows[joint]) for joint in _GUIDED) if rows else 0
+    rows, age = state.joint_rows, state.age.item
+    if not rows:
+        return 0
+    return max(age(rows[_LEFT_SH]), age(rows[_LEFT_SK]), age(rows[_RIGHT_SH]), age(rows[_RIGHT_SK]))
