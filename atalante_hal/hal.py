@@ -252,7 +252,7 @@ class Hal:
         if command.hand_over_exceeded:
             text = "a step started outside the hand-over box: the certificate of its guide does not apply to this step"
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, text, False)
-        if command.late:
+        if command.loop_late:
             text = "full assistance for the rest of this step: data or torques are later than its guide covers"
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, text, False)
         self._commands.drive(self._limiter.last, command.vibration)

@@ -104,7 +104,7 @@ class Command:
     hand_over_exceeded: bool = False
     #: True in the cycle in which a step starts without a guide, or its guide ends early, because the delay of the loop is longer
     #: than guides cover. The HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not react to it.
-    late: bool = False
+    loop_late: bool = False
 
 
 class Controller(Protocol):

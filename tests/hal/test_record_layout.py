@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from atalante_hal import record
 from atalante_hal.record_layout import Layout
 
 FIELDS = st.lists(
@@ -29,6 +30,11 @@ def test_layout_is_unchanged_by_json(fields: list[tuple[str, int]]) -> None:
     back = Layout.from_json(layout.to_json())
     assert (back.fields, back.size) == (layout.fields, layout.size)
     assert all(back[name] == layout[name] for name in layout)
+
+
+def test_index_of_each_header_field_is_its_position_in_the_record() -> None:
+    indices = [getattr(record, name.removesuffix("_us").upper()) for name in record.HEADER_FIELDS]
+    assert indices == list(range(len(record.HEADER_FIELDS)))
 
 
 @pytest.mark.parametrize(

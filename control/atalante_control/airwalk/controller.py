@@ -235,7 +235,8 @@ class AirwalkController:
         self._share.fill(1.0)
         self.pid.start_step(RIGHT, self._share)
         self._command.vibration.fill(0.0)
-        self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = self._command.late = False
+        self._command.outside = self._command.guide_left = False
+        self._command.hand_over_exceeded = self._command.loop_late = False
         self._outside = OutsideCount(self.config.outside_cycles)
         self._promised = False
         #: Angle deviations [rad] and speed deviations [rad/s] of hip and knee at the start of the step.
@@ -256,8 +257,8 @@ class AirwalkController:
             The command, overwritten by the next call.
         """
         cycle = state.cycle - self._changed_at
-        self._command.late = False
-        self._loop_delay.stays_uncovered(state)
+        self._command.loop_late = False
+        self._loop_delay.update(state)
         if self._walking:
             if step_over(cycle, self._cycles):
                 if self._stance == RIGHT:
@@ -307,7 +308,7 @@ class AirwalkController:
         self._command.step = (self._command.step or 0) + 1
         xi = min(1.0, max(0.0, state.assistance_factor))
         if xi < 1.0 and self._loop_delay.confirmed:
-            self._command.late, xi = True, 1.0
+            self._command.loop_late, xi = True, 1.0
             self.statistics.late += 1
         else:  # The factor 1 of a late step is no choice of the operator.
             self.statistics.factors.add(xi)

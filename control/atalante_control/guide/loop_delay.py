@@ -49,8 +49,8 @@ class LoopDelay:
         """
         return self._at_start + _oldest(state) <= COVERED
 
-    def stays_uncovered(self, state: State) -> bool:
-        """Count one cycle, and return whether the delay has been uncovered in several consecutive cycles.
+    def update(self, state: State) -> bool:
+        """Count one cycle, and return `confirmed`.
 
         Call this in every cycle, also without a guide. Otherwise the counted cycles would not be consecutive.
 

@@ -43,7 +43,7 @@ class Assumptions:
     mismatch: Mismatch = field(default_factory=Mismatch)  # largest errors of friction and inertia
     hand_over: HandOver = field(default_factory=HandOver)  # largest deviations when a step starts
     delays: tuple[int, int] = DELAYS  # cycles
-    rate: float = 20.0  # Nm, largest change of the command within one cycle that the limiter of the robot permits
+    rate: float = 20.0  # Nm, limit of the change of a command in one cycle, set by the limiter of the robot
     horizon: int = 300  # number of predicted cycles
     overlap: int = 100  # number of cycles of the next step in the tables; predictions can end in the next step
 

@@ -254,7 +254,8 @@ class WalkController:
         self._stage.assisted = self._stage.literal = self._stage.placed = False
         self._command.step, self._command.walking = None, False
         self._command.vibration.fill(0.0)
-        self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = self._command.late = False
+        self._command.outside = self._command.guide_left = False
+        self._command.hand_over_exceeded = self._command.loop_late = False
         self._load[:] = self._twist[:] = 0.0
         self.steering.reset()
         self._pid.reset()
@@ -375,13 +376,13 @@ class WalkController:
             self.stop()
         cycle = state.cycle - self._since
         following = next_phase(self.phase, self._facts(cycle))
-        self._command.late, late = False, self._loop_delay.stays_uncovered(state)
+        self._command.loop_late, late = False, self._loop_delay.update(state)
         if following is not None:
             self._begin(following, state)
             cycle = 0
             self._torque_before[:] = self._measured.sent
         elif late and self._assisted and cycle <= self._stage.last_guided:
-            self._command.late, self._stage.last_guided = True, cycle - 1
+            self._command.loop_late, self._stage.last_guided = True, cycle - 1
             self.statistics.guide.late += 1
             self._clear_guide_record()
         self._act(
@@ -562,9 +563,9 @@ class WalkController:
         stage.literal = self.config.literal_law and phase is Phase.STEP
         self._pid.limit_integral(math.inf if stage.literal else self.config.gains.integral_limit)
         guided = phase is Phase.STEP and state.assistance_factor < 1.0 and steps >= self._section.guided
-        self._command.late = guided and self._loop_delay.confirmed
-        self.statistics.guide.late += self._command.late
-        self._assisted = stage.assisted = guided and not self._command.late
+        self._command.loop_late = guided and self._loop_delay.confirmed
+        self.statistics.guide.late += self._command.loop_late
+        self._assisted = stage.assisted = guided and not self._command.loop_late
         stage.last_guided = len(self._section.assistance.unmodelled) - 1
         stage.placed = phase in (Phase.START, Phase.STEP) and not self._assisted and not stage.literal
         self._start(self._measured, self._table, self._parts)

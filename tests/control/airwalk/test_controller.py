@@ -169,7 +169,7 @@ def test_step_has_no_guide_if_the_loop_is_slower_than_the_guide_covers(delay: in
     for cycle in range(STARTUP + 2 * STEP + 10):
         state.age[SK] = 2 if (cycle % period if period else cycle > STARTUP + STEP) else 0
         command = controller.update(state)
-        if command.late:
+        if command.loop_late:
             found.append((cycle - STARTUP) // STEP)
             assert (cycle - STARTUP) % STEP == 0
         plant.step(command.torque.copy())

@@ -50,11 +50,11 @@ def test_delay_is_the_delay_at_start_plus_the_age_of_hip_and_knee(
 
 def test_five_consecutive_cycles_confirm_the_delay() -> None:
     loop, late, intact = LoopDelay(), state_with(0, {"left_SK": 2}), state_with(0, {})
-    assert [loop.stays_uncovered(late) for _ in range(4)] == [False] * 4
-    assert not loop.stays_uncovered(intact)
-    assert [loop.stays_uncovered(late) for _ in range(6)] == [False] * 4 + [True] * 2
+    assert [loop.update(late) for _ in range(4)] == [False] * 4
+    assert not loop.update(intact)
+    assert [loop.update(late) for _ in range(6)] == [False] * 4 + [True] * 2
     loop.reset(intact)
-    assert not loop.stays_uncovered(late)
+    assert not loop.update(late)
 
 
 def test_state_without_rows_of_the_joints_counts_as_new() -> None:
@@ -67,7 +67,7 @@ def test_delay_that_is_uncovered_at_start_needs_no_further_cycles() -> None:
     loop, slow = LoopDelay(), state_with(2, {})
     loop.reset(slow)
     assert loop.confirmed
-    assert loop.stays_uncovered(slow)
+    assert loop.update(slow)
     loop.reset(state_with(1, {}))
     assert not loop.confirmed
 
@@ -81,6 +81,6 @@ def test_lost_frames_that_the_hal_tolerates_do_not_confirm_a_delay(delay: int, l
     for _ in range(20000):
         state.age[rows] = np.where(rng.random(len(rows)) < loss, state.age[rows] + 1, 0)
         uncovered += not loop.is_covered(state)
-        confirmed += loop.stays_uncovered(state)
+        confirmed += loop.update(state)
     assert uncovered > 500
     assert confirmed < 10

@@ -598,7 +598,7 @@ def test_telemetry_shows_no_guide_after_the_guide_ended_within_the_step() -> Non
 
     def watch(state: State, command: Command) -> None:
         shown = fields_of(controller)
-        if command.late or (ended and controller.phase is Phase.STEP):
+        if command.loop_late or (ended and controller.phase is Phase.STEP):
             ended.append(
                 (shown["assistance_factor"].item(), *shown["q_bound"], *shown["error"], shown["lambda"].item())
             )
@@ -662,7 +662,7 @@ def walk_in_guide(
             if late_from is not None and controller.reached(0, late_from):
                 state.age[[state.joint_rows[joint] for joint in KNEES]] = 3
             command = robot.cycle(controller)
-            if command.late:
+            if command.loop_late:
                 jump = np.abs(command.torque - before)[KNEES].max()
                 late.append((fields_of(controller)["elapsed"].item() / WALK.step.duration, float(jump)))
             before[:] = command.torque
