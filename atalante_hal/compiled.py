@@ -40,6 +40,20 @@ R = TypeVar("R")
 _MARK = "creates-arrays"
 #: Function given to `specialised` -> True if the function creates arrays, so that numba must count references to arrays.
 _CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
+#: Functions whose machine code releases the interpreter lock, see `releases_gil`.
+_RELEASES_GIL: set[Callable[..., Any]] = set()
+
+
+def releases_gil(function: Function) -> Function:
+    """Decorate a function whose machine code releases the interpreter lock, so that other threads run during a call.
+
+    No other thread may use the arguments of a call before the call returns.
+
+    Args:
+        function: Function to compile with `compiled` or `specialised`.
+    """
+    _RELEASES_GIL.add(function)
+    return function
 
 
 def compiled(function: Function) -> Function:
@@ -140,7 +154,8 @@ def _compiled(function: FunctionType, counted: bool) -> Any:
     config.CACHE_DIR = str(folder or "")
     if folder is None or not any(folder.iterdir()):
         _log.info("compiling %s.%s", function.__module__, function.__qualname__)
-    return numba.njit(boundscheck=True, cache=folder is not None, _nrt=counted)(_twin(function, counted))
+    options = {"boundscheck": True, "nogil": function in _RELEASES_GIL, "cache": folder is not None, "_nrt": counted}
+    return numba.njit(**options)(_twin(function, counted))
 
 
 def _mark(function: Callable[..., Any]) -> None:
@@ -225,6 +240,8 @@ def _folder(function: FunctionType, counted: bool = True) -> Path | None:
     digest = hashlib.sha256(f"{_numba().__version__} {sys.version}".encode())
     for part in _compile_inputs(function):
         digest.update(part + b"\0")
+    if function in _RELEASES_GIL:
+        digest.update(releases_gil.__name__.encode())
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "atalante", "compiled")
     folder = base / f"{function.__name__.strip('_')}-{digest.hexdigest()[:16]}{'' if counted else '-uncounted'}"
     try:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from atalante_hal import compiled as module
-from atalante_hal.compiled import compiled, specialised
+from atalante_hal.compiled import compiled, releases_gil, specialised
 
 GAIN = 2.0
 
@@ -89,6 +89,19 @@ def test_specialised_function_counts_no_references_unless_it_creates_arrays(
         for function, counted in ((plain, False), (creating, True))
     ]
     assert ["NRT_" in code for code in codes] == [False, True]
+
+
+def test_only_a_decorated_function_releases_the_interpreter_lock(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # numba cannot show the code of a function from the cache
+    values = np.arange(4.0)
+    plain, decorated = _changed(_sum_of_first), releases_gil(_changed(_sum_of_first))
+    for function, releases in ((plain, False), (decorated, True)):
+        assert specialised(function, values, 2)(values, 3) == compiled(function)(values, 3) == GAIN * 3.0
+        for counted in (False, True):
+            code = "".join(module._compiled(function, counted).inspect_llvm().values())
+            assert ("PyEval_SaveThread" in code) is releases
 
 
 def test_calls_of_a_specialised_function_keep_the_reference_count_of_an_array() -> None:

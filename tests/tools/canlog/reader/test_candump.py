@@ -1,10 +1,14 @@
-"""Array parser of candump logs against the reader of python-can, on regular lines, irregular lines and damaged lines."""
+"""Parser of candump logs against the reader of python-can, on lines of the usual format, other lines and damaged lines.
+
+Each test runs twice: with the compiled function for usual lines, and with the regular expression alone.
+"""
 
 from __future__ import annotations
 
 import errno
 import io
 import os
+import sys
 from pathlib import Path
 
 import can
@@ -12,19 +16,22 @@ import numpy as np
 import pytest
 
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE
-from atalante_tools.canlog.reader import candump_log
+from atalante_tools.canlog.reader import candump, candump_log
 from atalante_tools.canlog.reader import log as log_module
 from atalante_tools.canlog.reader.candump import MARGIN, Parsed, parse
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, RECEIVED, SENT, Channels, Chunk
 from atalante_tools.canlog.reader.log import Log, open_log
 
 
+@pytest.fixture(params=["compiled", "regular expression"], autouse=True)
+def _parser(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(candump, "_COMPILED_BYTES", 0 if request.param == "compiled" else sys.maxsize)
+
+
 def parsed(text: str | bytes) -> tuple[Parsed, list[str]]:
     raw = text.encode() if isinstance(text, str) else text
-    memory = np.zeros(len(raw) + 2 * MARGIN, np.uint8)
-    memory[MARGIN : MARGIN + len(raw)] = np.frombuffer(raw, np.uint8)
     channels = Channels()
-    return parse(memory, MARGIN, MARGIN + len(raw), channels), channels.names
+    return parse(bytearray(raw) + bytes(MARGIN), 0, len(raw), channels), channels.names
 
 
 def one(line: str) -> tuple[dict[str, object], bool]:
@@ -268,3 +275,54 @@ def test_compressed_log_is_read_up_to_its_truncation(tmp_path: Path) -> None:
     log, chunks = read(path)
     assert 0 < sum(map(len, chunks)) < 4000
     assert [remark.rule for remark in log.remarks] == ["log-truncated"]
+
+
+def test_payload_of_a_rejected_line_is_not_in_the_next_frame() -> None:
+    result, _ = parsed("(0.000001) can0 100##1" + "FF" * 64 + " X\n(0.000002) can0 101#01\n")
+    assert (len(result.chunk), result.unreadable) == (1, 1)
+    assert result.chunk.frames["data"][0].tolist() == [1] + [0] * 63
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "(1700000000.000001)  123#00 R",  # no channel
+        "(.000001) can0 123#00",
+        "(12345678901.000001) can0 123#00",
+        "(1.0000001234) can0 123#00",
+        "(1.000001) can0 #00",
+        "(1.000001) can0 12345#00",
+        "(1.000001)can0 123#00",
+    ],
+)
+def test_line_without_a_field_is_unreadable_after_a_channel_with_a_long_name(line: str) -> None:
+    result, _ = parsed(f"(1.000001) a-very-long-channel-name-indeed 123#11\n{line}\n")
+    assert (len(result.chunk), result.unreadable, result.first_unreadable) == (1, 1, line.encode())
+
+
+def test_many_channel_names_share_the_last_number() -> None:
+    """The names after the 256th have the last number, in the first lines and in later lines."""
+    lines = [f"({number}.000000) can{number} 100#00\n" for number in range(300)]
+    result, names = parsed("".join(lines + lines))
+    assert names == [f"can{number}" for number in range(256)]
+    assert result.chunk.channels.tolist() == [min(number, 255) for number in range(300)] * 2
+
+
+def test_short_and_long_texts_give_the_same_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "".join(f"{line}\n" for line in random_lines(4, 2000)).encode()
+    monkeypatch.setattr(candump, "_COMPILED_BYTES", len(text))
+    by_function, names = parsed(text)
+    monkeypatch.setattr(candump, "_COMPILED_BYTES", len(text) + 1)
+    by_expression, same_names = parsed(text)
+    assert names == same_names
+    for field in ("frames", "stamps", "channels", "sent"):
+        assert getattr(by_function.chunk, field).tobytes() == getattr(by_expression.chunk, field).tobytes()
+
+
+def test_compiled_function_gives_the_same_as_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "".join(f"{line}\n" for line in random_lines(5, 200)).encode()
+    by_machine_code, _ = parsed(text)
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    by_python, _ = parsed(text)
+    assert by_machine_code.chunk.frames.tobytes() == by_python.chunk.frames.tobytes()
+    assert by_machine_code.chunk.stamps.tolist() == by_python.chunk.stamps.tolist()

@@ -7,17 +7,13 @@ import io
 import zlib
 from collections.abc import Iterator
 
-import numpy as np
-import numpy.typing as npt
-
 from atalante_tools.canlog.reader import candump
 from atalante_tools.canlog.reader.candump import MARGIN
 from atalante_tools.canlog.reader.chunk import Chunk, concatenated
 from atalante_tools.canlog.reader.log_file import LogFile
 
-#: Number of bytes of the log that one call of `candump.parse` parses.
-#: The arrays that `candump.parse` creates for `_TEXT_BYTES` bytes of text fit into the processor cache.
-_TEXT_BYTES = 1 << 21
+#: Number of bytes of the log that one call of `candump.parse` parses, usually one chunk of frames.
+_TEXT_BYTES = 1 << 23
 
 
 def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
@@ -27,31 +23,31 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
         log: log to read; channels, position and remarks are updated.
         chunk_frames: minimum number of frames per chunk; only the last chunk may be smaller.
     """
-    text = np.zeros(_TEXT_BYTES + 2 * MARGIN, np.uint8)
-    memory = text.data
+    text = bytearray(_TEXT_BYTES + MARGIN)
+    memory = memoryview(text)
     unreadable, example = 0, b""
     gathered: list[Chunk] = []
     kept, line_too_long = 0, False
     broken = ""
     with _open(log) as file:
         while True:
-            got, broken = _fill(file, memory[MARGIN + kept : MARGIN + _TEXT_BYTES])
+            got, broken = _fill(file, memory[kept:_TEXT_BYTES])
             log.position = file.tell() if not log.compressed else log.position
-            end = MARGIN + kept + got
             if not got:
                 break  # end of the file, or a read error; `broken` is the text of the read error
-            stop = _after_last_newline(text, end - got, end)
+            end = kept + got
+            stop = text.rfind(b"\n", kept, end) + 1
             if not stop:
-                kept += got
+                kept = end
                 if kept == _TEXT_BYTES:
                     if not line_too_long:
-                        example = example if unreadable else memory[MARGIN : MARGIN + 100].tobytes()
+                        example = example if unreadable else bytes(memory[:100])
                         unreadable += 1
                     kept, line_too_long = 0, True
                 continue
-            start = MARGIN
+            start = 0
             if line_too_long:  # skip the rest of the line that was too long
-                start += int(np.argmax(text[MARGIN:stop] == ord("\n"))) + 1
+                start = text.index(b"\n") + 1
                 line_too_long = False
             parsed = candump.parse(text, start, stop, log.channels)
             example = example if unreadable else parsed.first_unreadable
@@ -59,13 +55,13 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
             if len(parsed.chunk):
                 gathered.append(parsed.chunk)
             kept = end - stop
-            text[MARGIN : MARGIN + kept] = text[stop:end].copy()
+            memory[:kept] = bytes(memory[stop:end])
             if sum(map(len, gathered)) >= chunk_frames:
                 yield concatenated(gathered)
                 gathered.clear()
     if gathered:
         yield concatenated(gathered)
-    last_line = text[MARGIN : MARGIN + kept].tobytes().strip()
+    last_line = bytes(memory[:kept]).strip()
     _remark(log, unreadable, example, last_line, broken)
 
 
@@ -113,18 +109,6 @@ def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, 
             break
         total += got
     return total, ""
-
-
-def _after_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> int:
-    """Return the index after the last newline in `text[begin:end]`, or 0 if this text has no newline.
-
-    The search starts at the end of the text.
-    """
-    for first in (max(begin, end - 4 * MARGIN), begin):
-        newlines = np.flatnonzero(text[first:end] == ord("\n"))
-        if len(newlines):
-            return first + int(newlines[-1]) + 1
-    return 0
 
 
 def _shown(line: bytes) -> str:

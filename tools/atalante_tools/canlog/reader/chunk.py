@@ -13,7 +13,7 @@ from atalante_hal.wire.frame import Frames, as_words, new_frames
 
 #: Direction of a frame according to the log; `NO_DIRECTION` if the log contains no directions.
 SENT, RECEIVED, NO_DIRECTION = 1, 0, -1
-_MAX_CHANNELS = 256
+MAX_CHANNELS = 256  # maximum number of channel names in a log
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Channels:
             name: name of the channel in the log.
         """
         if name not in self.names:
-            if len(self.names) == _MAX_CHANNELS:
-                return _MAX_CHANNELS - 1
+            if len(self.names) == MAX_CHANNELS:
+                return MAX_CHANNELS - 1
             self.names.append(name)
         return self.names.index(name)

@@ -1,4 +1,4 @@
-"""Reader of CAN logs in chunks of frames: an array parser for candump logs, and python-can for all other formats.
+"""Reader of CAN logs in chunks of frames: a parser for candump logs, and python-can for all other formats.
 
 The required memory depends on the chunk size, not on the length of the log. The reader returns all readable frames. For
 unreadable parts of a log, the reader adds remarks. The validator reports each remark as a finding.
@@ -17,7 +17,7 @@ from atalante_tools.canlog.reader import candump_log, python_can_log
 from atalante_tools.canlog.reader.chunk import Chunk
 from atalante_tools.canlog.reader.log_file import FORMATS, LogError, LogFile
 
-_CHUNK_FRAMES = 120_000  # minimum number of frames in a chunk; only the last chunk is smaller
+_CHUNK_FRAMES = 100_000  # minimum number of frames in a chunk; only the last chunk is smaller
 
 
 class Log(LogFile):
