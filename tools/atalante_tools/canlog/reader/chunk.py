@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,19 @@ class Chunk:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @cached_property
+    def headers(self) -> npt.NDArray[np.uint64]:
+        """Return the header word of each frame (`header_word`) as a contiguous array. Shape (n,).
+
+        Reading this array takes less time than reading every ninth word of `frames`.
+        """
+        return np.ascontiguousarray(as_words(self.frames)[:, 0])
+
+    @property
+    def can_ids(self) -> npt.NDArray[np.uint32]:
+        """Return the identifier of each frame with its flag bits. Shape (n,)."""
+        return self.headers.view("<u4")[::2]
 
     def select(self, indices: npt.NDArray[Any]) -> Chunk:
         """Return a chunk with the selected frames.

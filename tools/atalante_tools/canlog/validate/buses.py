@@ -59,12 +59,10 @@ class ChannelMap:
             self.bus_of_channel[channel] = self._bus_of(names[channel], of_channel)
             if len(of_channel):
                 self._silent.remove(channel)
-        if bool((self._channel_of_row[: len(self._plan.layouts)] != UNKNOWN).all()):
-            return
-        seen, first = np.unique(rows, return_index=True)
-        for row, index in zip(seen.tolist(), first.tolist(), strict=True):
-            if row >= 0 and self._channel_of_row[row] == UNKNOWN:
-                self._channel_of_row[row] = self._expected_channel(row, int(chunk.channels[index]))
+        new = np.flatnonzero((rows >= 0) & (self._channel_of_row[rows] == UNKNOWN))
+        seen, first = np.unique(rows[new], return_index=True)
+        for row, index in zip(seen.tolist(), new[first].tolist(), strict=True):
+            self._channel_of_row[row] = self._expected_channel(row, int(chunk.channels[index]))
 
     def on_wrong_channel(self, chunk: Chunk, rows: Rows) -> npt.NDArray[np.bool_]:
         """Return True for each frame that was received on a wrong channel. Shape (n,).

@@ -58,7 +58,7 @@ class FrameRules:
 
     def rows(self, chunk: Chunk) -> Rows:
         """Return the message index of each frame; `UNKNOWN` for error frames and unknown identifiers. Shape (n,)."""
-        can_ids = chunk.frames["can_id"]
+        can_ids = chunk.can_ids
         if int(can_ids.max(initial=0)) < ID_ERROR:
             return self._plan.rows(can_ids)
         rows = self._plan.rows(can_ids & np.uint32(~ID_REMOTE & 0xFFFFFFFF))
@@ -78,8 +78,7 @@ class FrameRules:
         """
         self._channel_map.update(chunk, rows, channel_names)
         self._check_sender(chunk, rows)
-        headers = as_words(chunk.frames)[:, 0]
-        matches = (headers == self._plan.headers[rows]) & (rows != UNKNOWN)
+        matches = (chunk.headers == self._plan.headers[rows]) & (rows != UNKNOWN)
         on_wrong_channel = self._channel_map.on_wrong_channel(chunk, rows)
         indices = np.flatnonzero(~matches | on_wrong_channel)
         if not len(indices):

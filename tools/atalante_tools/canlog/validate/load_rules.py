@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, as_words
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE
 from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.reader.chunk import Chunk
 from atalante_tools.canlog.validate.buses import ChannelMap
@@ -121,13 +121,12 @@ class LoadRules:
         if self._plan.catalogue.data_bitrate is None and bool((chunk.frames["flags"] & FLAG_BRS).any()):
             self.unknown_bitrate = True
         known = (rows >= 0) & (rows < len(self._plan.layouts))
-        headers = as_words(chunk.frames)[:, 0]
         at = np.where(known, rows, 0)
         seconds = self._of_row[at]
         if self._keeps_flags:
-            usual = known & (headers == self._plan.headers[rows])
+            usual = known & (chunk.headers == self._plan.headers[rows])
         else:  # the log does not show which frames are CAN FD, so the DBC gives the wire time of a known message
-            usual = known & ((chunk.frames["can_id"] & np.uint32(ID_REMOTE)) == 0)
+            usual = known & ((chunk.can_ids & np.uint32(ID_REMOTE)) == 0)
         if not bool(usual.all()):
             self._time_unusual(chunk, np.flatnonzero(~usual), seconds)
         bus = self._bus(chunk, known, at)
