@@ -168,6 +168,7 @@ class Emulator:
         self._emergencies: list[Emergency] = []  # emergency messages to send in this cycle
         self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
         self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")], self._emergency_tx)
+        self._statuses: Sequence[Frames] = ()  # status messages that are due in this cycle
 
         received = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
         syncs = [m for m in received if m.name.startswith("SYNC_")]
@@ -426,8 +427,8 @@ class Emulator:
     def _sample_next(self) -> None:
         """Sample the sensors, and encode the frames that the nodes will send after the next SYNC.
 
-        A callable in `before_send` may change the values after the next SYNC. With such a callable, the frames are encoded after
-        that SYNC.
+        The HAL waits for these frames, so they are encoded before that SYNC. A callable in `before_send` may change the values
+        after the SYNC. With such a callable, the 1 ms messages are encoded after the SYNC.
         """
         body = self.body
         position = body.position
@@ -440,6 +441,7 @@ class Emulator:
             self._noise.draw()
         if not self.before_send:
             self._seal()
+        self._statuses = self._heartbeats.due(self.cycle)
 
     def _seal(self) -> None:
         self._noise.add(self.cycle, self._truth, self._tx.values)
@@ -508,8 +510,8 @@ class Emulator:
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
             parts = [*parts, self._haptics_tx.seal()]
-        if due := self._heartbeats.due(self.cycle):
-            parts = [*parts, *due]
+        if self._statuses:
+            parts = [*parts, *self._statuses]
         if self._emergencies:
             parts = [*parts, *self._seal_emergencies()]
         return parts

@@ -79,11 +79,14 @@ class FootChecks:
         if lifted and self._forces.dot(self._forces) <= self._free_squared and not any(self._contradicts + self._pulls):
             return False
         on_ground = []
+        free = self._free
         for foot, cells in enumerate(self._force[:, :, 2].tolist()):
-            carries = [abs(force) > self._free for force in cells]
-            on_ground.append(sum(carries) >= 2)
+            front_left, front_right, rear_left, rear_right = cells
+            carrying = (abs(front_left) > free) + (abs(front_right) > free)
+            carrying += (abs(rear_left) > free) + (abs(rear_right) > free)
+            on_ground.append(carrying >= 2)
             if updated[foot]:
-                self._check_cells(foot, cells, carries)
+                self._check_cells(foot, cells)
         self.swing = None if on_ground[0] == on_ground[1] else on_ground.index(False)
         if any(on_ground):
             self._swinging = 0
@@ -104,16 +107,17 @@ class FootChecks:
     def _both_swing(self) -> bool:
         return self._armed and self._swinging >= SWING_CYCLES
 
-    def _check_cells(self, foot: int, cells: list[float], carries: list[bool]) -> None:
+    def _check_cells(self, foot: int, cells: list[float]) -> None:
         front_left, front_right, rear_left, rear_right = cells
         twist = front_left + rear_right - front_right - rear_left
         self._contradicts[foot] = self._contradicts[foot] + self._every if abs(twist) > self._twist else 0
         if self._contradicts[foot] >= CELL_CYCLES:
             if foot not in self._twisted or self._twisted[foot][1] is None:
-                self._twisted[foot] = twist, _deviating_cell(carries)
+                self._twisted[foot] = twist, _deviating_cell([abs(force) > self._free for force in cells])
         else:
             self._twisted.pop(foot, None)
-        load, pulled = sum(cells), abs(twist) <= self._twist and sum(cells) < -2.0 * self._free
+        load = sum(cells)
+        pulled = abs(twist) <= self._twist and load < -2.0 * self._free
         self._pulls[foot] = self._pulls[foot] + self._every if pulled else 0
         if self._pulls[foot] >= CELL_CYCLES:
             self._pulled.setdefault(foot, load)

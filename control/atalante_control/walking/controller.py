@@ -452,7 +452,7 @@ class WalkController:
             self._stage.gyro_source = self._gyro_source = source
         if self.config.heading_reference and not replaced:
             self._observer.follow_heading(state.imu_quaternion[_PELVIS].tolist())
-        feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > SENSOR_AGE]
+        feet = [side for side, row in enumerate(state.foot_rows) if state.age.item(row) > SENSOR_AGE]
         if len(feet) == 1:
             self._forces[:] = state.foot_force
             self._forces[feet[0], :, 2] = self._load_without(feet[0]) / len(CELLS)
@@ -466,7 +466,7 @@ class WalkController:
 
     def _is_unusable(self, state: State, imu: int) -> bool:
         """Return whether the data of an IMU is too old, or was implausible in this walk."""
-        lost = bool(state.imu_rows) and bool(state.age[state.imu_rows[imu]] > SENSOR_AGE)
+        lost = bool(state.imu_rows) and state.age.item(state.imu_rows[imu]) > SENSOR_AGE
         return lost or imu in self._distrusted
 
     def _vertical_of_stance_leg(self, state: State) -> Vector:
@@ -523,9 +523,9 @@ class WalkController:
         if phase in STEPPING:
             # In a step, `elapsed` counts rows of the table of the desired motion.
             # The number of rows per cycle can be above or below 1, because step timing changes the speed of the step.
-            elapsed = int(self._clock[0] + self._pace[0])
+            elapsed = int(self._clock.item() + self._pace.item())
             swing = 1 - self._stance
-            contact = contact_force(load[swing], float(self._twist[swing]))
+            contact = contact_force(load[swing], self._twist.item(swing))
             landed = self._landed = self._impact.update(contact, elapsed / nominal)
         loaded = self._loaded >= self._settled
         stopping = self._stopping or self.steps_begun >= self.steps_wanted
