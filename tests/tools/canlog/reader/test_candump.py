@@ -300,6 +300,12 @@ def test_line_without_a_field_is_unreadable_after_a_channel_with_a_long_name(lin
     assert (len(result.chunk), result.unreadable, result.first_unreadable) == (1, 1, line.encode())
 
 
+def test_channel_names_that_differ_only_in_a_nul_are_different_channels() -> None:
+    result, names = parsed("(1.000000) \0can0 100#00\n(2.000000) can0 100#00\n(3.000000) \0can0 100#00\n")
+    assert names == ["\0can0", "can0"]
+    assert result.chunk.channels.tolist() == [0, 1, 0]
+
+
 def test_many_channel_names_share_the_last_number() -> None:
     """The names after the 256th have the last number, in the first lines and in later lines."""
     lines = [f"({number}.000000) can{number} 100#00\n" for number in range(300)]

@@ -247,11 +247,12 @@ class _NameTable:
     def table(self) -> npt.NDArray[np.uint64]:
         """Return the ASCII codes of each name as a 128-bit number, high word first. Shape (channels, 2).
 
-        A name that is too long for a line of the usual format has the number 0.
+        A name that is too long for a line of the usual format has the number 0. So does a name with a control character, because
+        a NUL at its begin does not change the number.
         """
         for row in range(self._count, len(self._channels.names)):
             name = self._channels.names[row]
-            if name.isascii() and len(name) <= _NAME_BYTES:
+            if name.isascii() and name.isprintable() and len(name) <= _NAME_BYTES:
                 number = int.from_bytes(name.encode(), "big")
                 self._table[row] = number >> 64, number & (1 << 64) - 1
         self._count = len(self._channels.names)
