@@ -121,6 +121,7 @@ def test_chunk_size_does_not_change_the_frames(tmp_path: Path, monkeypatch: pyte
             {"id": 0x181, "flags": FLAG_FDF | FLAG_BRS, "data": b"\xaa\xbb", "stamp": 1_000_000},
         ),
         ("(12.345678912) can0 7FF#", {"id": 0x7FF, "flags": 0, "len": 0, "stamp": 12_345_678_912}),
+        ("(9223372036.854775807) can0 7FF#", {"stamp": 2**63 - 1}),
         ("(1700000000.000001) can0 123#R", {"id": 0x123 | ID_REMOTE, "len": 0}),
         ("(1700000000.000001) can0 123#R4 T", {"id": 0x123 | ID_REMOTE, "len": 4, "sent": SENT}),
         ("(1700000000.000001) can0 00000123#11", {"id": 0x123 | ID_EXTENDED, "data": b"\x11"}),
@@ -161,6 +162,8 @@ def test_lines_of_every_format_are_read(line: str, expected: dict[str, object]) 
         "(1700000000.000000) vcan0 181#00#11",
         "(1700000000.000000) vcan0 FFFFFFFFF#00",
         "(1700000000.000000) vcan0 4000000F#00",
+        "(9223372036.854775808) left_leg 181#00",
+        "(9999999999.000000) left_leg 181##1AABB R",
     ],
 )
 def test_invalid_lines_are_counted_as_unreadable(line: str) -> None:

@@ -47,6 +47,8 @@ _UPPER_CASE = 0xDF  # mask that changes a lower-case letter to upper case
 _NAME_BYTES = 16  # maximum length of a channel name in a line of the usual format; Linux allows 15
 _MAX_BYTES = 64  # maximum length of a payload
 _STANDARD = 0x7FF
+_STAMP_END = 1 << 63  # first time that does not fit into a stamp [ns], in the year 2262
+_MAX_SECONDS = _STAMP_END // 10**9 - 1  # maximum time in a line of the usual format [s]; all its fractions fit into a stamp
 _NO_DIGIT = 0x1000
 #: Lookup table: ASCII code -> value of the hexadecimal digit (0 to 15), or `_NO_DIGIT` if the character is not such a digit.
 _DIGITS = np.full(256, _NO_DIGIT, np.int64)
@@ -138,7 +140,7 @@ def parse_usual(
         columns.words[row] = 0  # the caller may have rejected a line of which this function had parsed the payload
     while begin < end:
         seconds, dot = _number(text, begin + 1, 10, 10)
-        if text[begin] != _OPEN or dot == begin + 1 or text[dot] != _DOT:
+        if text[begin] != _OPEN or dot == begin + 1 or text[dot] != _DOT or seconds > _MAX_SECONDS:
             break
         fraction, close = _number(text, dot + 1, 10, 10)
         decimals = close - dot - 1
@@ -268,8 +270,9 @@ def _read_line(line: bytes, chunk: Chunk, row: int, channels: Channels) -> bool:
     if match is None:
         return False
     number = int(match[4], 16)
+    stamp = int(match[1]) * 10**9 + int(match[2].ljust(9, b"0"))
     data = bytes.fromhex((match[7] or match[10] or b"").decode())
-    if len(data) > _MAX_BYTES or (len(match[4]) == 3 and number > _STANDARD):
+    if stamp >= _STAMP_END or len(data) > _MAX_BYTES or (len(match[4]) == 3 and number > _STANDARD):
         return False
     if len(match[4]) == 8:
         if number > ID_MASK | ID_ERROR:
@@ -279,7 +282,7 @@ def _read_line(line: bytes, chunk: Chunk, row: int, channels: Channels) -> bool:
     length = int(match[9] or 0) if match[8] else len(data)
     flags = FLAG_FDF | int(match[6], 16) & (FLAG_BRS | FLAG_ESI) if match[5] else 0
     FRAME_STRUCT.pack_into(chunk.frames.data, row * FRAME_BYTES, number, length, flags, data)
-    chunk.stamps[row] = int(match[1]) * 10**9 + int(match[2].ljust(9, b"0"))
+    chunk.stamps[row] = stamp
     chunk.channels[row] = channels.index(match[3].decode("ascii", "replace"))
     letter = (match[12] or b"").upper()
     chunk.sent[row] = SENT if letter == b"T" else RECEIVED if letter == b"R" else NO_DIRECTION
