@@ -9,6 +9,7 @@ import errno
 import io
 import os
 import sys
+import tracemalloc
 from pathlib import Path
 
 import can
@@ -307,6 +308,19 @@ def test_channel_names_that_differ_only_in_a_nul_are_different_channels() -> Non
     result, names = parsed("(1.000000) \0can0 100#00\n(2.000000) can0 100#00\n(3.000000) \0can0 100#00\n")
     assert names == ["\0can0", "can0"]
     assert result.chunk.channels.tolist() == [0, 1, 0]
+
+
+@pytest.mark.parametrize("mark", ["#", "##1"])
+def test_long_payload_needs_little_memory(mark: str) -> None:
+    text = b"(1.000000) can0 100" + mark.encode() + b"A" * 1_000_000 + b"\n"
+    tracemalloc.start()
+    try:
+        result, _ = parsed(text)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert result.unreadable == 1
+    assert peak < 10 * len(text)
 
 
 def test_many_channel_names_share_the_last_number() -> None:
