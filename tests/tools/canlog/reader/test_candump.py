@@ -183,6 +183,11 @@ def test_blank_lines_are_ignored() -> None:
     assert (len(result.chunk), result.unreadable) == (1, 0)
 
 
+def test_digit_after_an_empty_last_line_is_not_read() -> None:
+    text = bytearray(b"\n" + b"1" * MARGIN)
+    assert len(parse(text, 0, 1, Channels()).chunk) == 0
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_damaged_lines_never_give_a_wrong_frame(seed: int) -> None:
     """A line with one changed byte gives the same frame as `parse_simply`, or is counted as unreadable."""

@@ -141,8 +141,10 @@ def parse_usual(
     if begin < end:
         columns.words[row] = 0  # the caller may have rejected a line of which this function had parsed the payload
     while begin < end:
+        if text[begin] != _OPEN:  # checked first, because an empty last line is followed by bytes of an earlier text
+            break
         seconds, dot = _number(text, begin + 1, 10, 10)
-        if text[begin] != _OPEN or dot == begin + 1 or text[dot] != _DOT or seconds > _MAX_SECONDS:
+        if dot == begin + 1 or text[dot] != _DOT or seconds > _MAX_SECONDS:
             break
         fraction, close = _number(text, dot + 1, 10, 10)
         decimals = close - dot - 1
