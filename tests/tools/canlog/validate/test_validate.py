@@ -24,13 +24,15 @@ from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import crc, data_id_bytes
 from atalante_hal.wire.frame import FRAME, Frames, new_frames
 from atalante_tools.canlog.plan import Plan
+from atalante_tools.canlog.reader import candump, candump_log
+from atalante_tools.canlog.reader import log as log_module
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, Chunk
 from atalante_tools.canlog.reader.log import open_log
 from atalante_tools.canlog.reader.log_file import LogError
 from atalante_tools.canlog.validate.project import Project, ProjectError, load_project
 from atalante_tools.canlog.validate.report import Report, report, text
 from atalante_tools.canlog.validate.rules import RULES
-from atalante_tools.canlog.validate.run import listen
+from atalante_tools.canlog.validate.run import listen, validate_log
 from atalante_tools.canlog.validate.timing_rules import BINS, jitter_p99
 from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.cli import cli
@@ -129,6 +131,26 @@ def plan() -> Plan:
 @pytest.fixture
 def good(tmp_path: Path) -> Path:
     return write(tmp_path / "good.log", MESSAGES)
+
+
+def test_first_chunk_is_read_in_the_main_thread(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first chunk may compile the parser, and a stop signal interrupts a compilation only in the main thread."""
+    whole = good.read_bytes()
+    threads = []
+    parse = candump.parse
+
+    def parse_and_record(*arguments: Any) -> candump.Parsed:
+        threads.append(threading.current_thread())
+        return parse(*arguments)
+
+    monkeypatch.setattr(candump, "parse", parse_and_record)
+    monkeypatch.setattr(candump_log, "_TEXT_BYTES", len(whole) // 3)
+    monkeypatch.setattr(log_module, "_CHUNK_FRAMES", 1)
+    result = validate_log(good, Plan(catalogue(atalante_dbc.DBC_FILE)), Project())
+    assert result.validator.frames == whole.count(b"\n")
+    assert threads[0] is threading.main_thread()
+    assert len(threads) > 2
+    assert all(thread is not threading.main_thread() for thread in threads[1:])
 
 
 # -- formats ---------------------------------------------------------------------------------------------------------------

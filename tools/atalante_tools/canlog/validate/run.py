@@ -60,8 +60,14 @@ def _read_ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
     """Yield each chunk of a log together with the share of the log that has been read, 0 to 1.
 
     A thread reads the next chunk while the caller checks the current chunk. Both threads spend most of their time in
-    numpy operations, which release the interpreter lock.
+    numpy operations and compiled functions, which release the interpreter lock. The first chunk is read in the thread of the
+    caller, because its reader may compile a function. A stop signal interrupts a compilation only in the main thread.
     """
+    chunks = log.chunks()
+    first = next(chunks, None)
+    if first is None:
+        return
+    share = log.position / max(1, log.size)
     ready: queue.Queue[tuple[Chunk, float] | BaseException | None] = queue.Queue(maxsize=1)
     abandoned = threading.Event()
 
@@ -75,7 +81,7 @@ def _read_ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
 
     def read() -> None:
         try:
-            for chunk in log.chunks():
+            for chunk in chunks:
                 offer((chunk, log.position / max(1, log.size)))
                 if abandoned.is_set():
                     return
@@ -87,6 +93,7 @@ def _read_ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
     reader = threading.Thread(target=read, name="log reader", daemon=True)
     reader.start()
     try:
+        yield first, share
         while (item := ready.get()) is not None:
             if isinstance(item, BaseException):
                 raise item
