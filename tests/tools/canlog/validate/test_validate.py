@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import gzip
 import json
+import signal
 import threading
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from contextlib import suppress
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from atalante_tools.canlog.reader import log as log_module
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, Chunk
 from atalante_tools.canlog.reader.log import open_log
 from atalante_tools.canlog.reader.log_file import LogError
+from atalante_tools.canlog.validate import run as run_module
 from atalante_tools.canlog.validate.project import Project, ProjectError, load_project
 from atalante_tools.canlog.validate.report import Report, report, text
 from atalante_tools.canlog.validate.rules import RULES
@@ -36,6 +39,7 @@ from atalante_tools.canlog.validate.run import listen, validate_log
 from atalante_tools.canlog.validate.timing_rules import BINS, jitter_p99
 from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.cli import cli
+from atalante_tools.console.stop_request import Stopped, check_stop, ended_by
 
 NETWORK = atalante_dbc.load()
 MakeRig = Callable[..., Any]
@@ -131,6 +135,28 @@ def plan() -> Plan:
 @pytest.fixture
 def good(tmp_path: Path) -> Path:
     return write(tmp_path / "good.log", MESSAGES)
+
+
+@pytest.mark.parametrize("command", ["validate", "decode"])
+def test_stop_signal_discarded_by_a_library_ends_the_command(
+    command: str, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """python-can discards every exception while it imports asammdf. The command ends without a report."""
+    opened = log_module.open_log
+
+    def discard(path: Path) -> log_module.Log:
+        with suppress(Stopped):
+            signal.raise_signal(signal.SIGTERM)
+            check_stop()
+        return opened(path)
+
+    monkeypatch.setattr(log_module, "open_log", discard)
+    monkeypatch.setattr(run_module, "open_log", discard)
+    with ended_by(lambda: None):
+        result = run(command, good, *(() if command == "validate" else ("-o", tmp_path / "out.parquet")))
+    assert result.exit_code == 128 + signal.SIGTERM
+    assert result.stdout == ""
+    assert not (tmp_path / "out.parquet").exists()
 
 
 def test_first_chunk_is_read_in_the_main_thread(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from atalante_tools.console.outcome import FAILED, Failed
+from atalante_tools.console.stop_request import check_stop
 from atalante_tools.console.terminal import Progress, print_message
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     with _complete_file(out) as part, closing(_sink(part, out.suffix.lower(), plan)) as sink:
         for source in sources:
             for chunk in source.chunks():
+                check_stop()  # python-can and numba may discard the exception of a stop signal
                 for decoded in decoder.decode(chunk):
                     sink.write(decoded, source.channels.names)
                 sink.flush()
@@ -66,6 +68,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
                     share = 100.0 * source.position / max(1, source.size)
                     progress.show(f"{source.path.name}: {share:.0f} %, {decoder.frames} frames, {sink.values} values")
             progress.clear()
+            check_stop()
             for remark in source.remarks:
                 print_message(remark.sentence)
                 truncated |= remark.rule == "log-truncated"

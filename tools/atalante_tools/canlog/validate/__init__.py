@@ -16,7 +16,7 @@ import click
 
 from atalante_tools.console.options import Between, OutputFile, json_option, options_as
 from atalante_tools.console.outcome import FAILED, INTERRUPTED, Failed
-from atalante_tools.console.stop_request import stop_requested
+from atalante_tools.console.stop_request import check_stop, stop_requested
 from atalante_tools.console.terminal import Progress, print_message, show_json
 
 if TYPE_CHECKING:
@@ -200,6 +200,7 @@ def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) 
         progress = Progress()
 
         def show(share: float, frames: int, path: Path = path, progress: Progress = progress) -> None:
+            check_stop()  # python-can and numba may discard the exception of a stop signal
             if progress.due():
                 progress.show(f"{path.name}: {100.0 * share:.0f} %, {frames} frames")
 
@@ -210,6 +211,7 @@ def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) 
             results.append(Unread(str(path), str(error)))
             code = FAILED
         progress.clear()
+        check_stop()
     return results, code
 
 
