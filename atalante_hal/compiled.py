@@ -152,10 +152,36 @@ def _compiled(function: FunctionType, counted: bool) -> Any:
     config.CPU_NAME, config.CPU_FEATURES = "generic", ""
     folder = _folder(function, counted)
     config.CACHE_DIR = str(folder or "")
-    if folder is None or not any(folder.iterdir()):
-        _log.info("compiling %s.%s", function.__module__, function.__qualname__)
     options = {"boundscheck": True, "nogil": function in _RELEASES_GIL, "cache": folder is not None, "_nrt": counted}
-    return numba.njit(**options)(_twin(function, counted))
+    dispatcher = numba.njit(**options)(_twin(function, counted))
+    _report_compilations(dispatcher)
+    return dispatcher
+
+
+def _report_compilations(dispatcher: Any) -> None:
+    """Log each compilation of a function by numba, just before it begins.
+
+    The cache folder does not show whether numba will compile. numba also compiles a function if another part of its source file
+    changed, for example by an update, and for new types of arguments.
+
+    Args:
+        dispatcher: Function wrapped by `numba.njit`.
+    """
+    from numba.core import event
+
+    class Reporter(event.Listener):
+        """Listener of the event that numba triggers before and after each compilation."""
+
+        def on_start(self, started: Any) -> None:
+            """Log the compilation, if it is not that of a function which `dispatcher` calls."""
+            if started.data["dispatcher"] is dispatcher:
+                _log.info("compiling %s.%s", dispatcher.py_func.__module__, dispatcher.py_func.__qualname__)
+
+        def on_end(self, _ended: Any) -> None:
+            """Ignore the end of a compilation."""
+
+    register: Callable[..., None] = event.register
+    register("numba:compile", Reporter())
 
 
 def _mark(function: Callable[..., Any]) -> None:

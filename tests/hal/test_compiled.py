@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import runpy
 import subprocess
 import sys
 from collections.abc import Callable
@@ -258,6 +259,30 @@ def test_compilation_is_logged_once(
     for _ in range(2):
         assert compiled(_changed(_cubed))(2.0) == 8.0
     assert [record.getMessage() for record in caplog.records] == [f"compiling {__name__}._cubed"]
+
+
+def test_compilation_after_a_change_elsewhere_in_the_file_is_logged(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """numba compiles all functions of a changed file again. The cache folder of an unchanged function is then not empty."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    caplog.set_level("INFO", logger=module.__name__)
+    kernel = tmp_path / "kernel.py"
+    for comment in ("", "", "# changed\n"):
+        kernel.write_text("def square(x):\n    return x * x\n" + comment)
+        assert compiled(runpy.run_path(str(kernel))["square"])(3.0) == 9.0
+    assert [record.getMessage() for record in caplog.records] == ["compiling <run_path>.square"] * 2
+
+
+def test_compilation_for_other_types_is_logged(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    caplog.set_level("INFO", logger=module.__name__)
+    function = compiled(_changed(_cubed))
+    for value in (2.0, 2.0, 2):
+        assert function(value) == 8
+    assert [record.getMessage() for record in caplog.records] == [f"compiling {__name__}._cubed"] * 2
 
 
 def _cubed(x: float) -> float:
