@@ -145,6 +145,25 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.mark.parametrize(
+    ("arguments", "command"),
+    [
+        (["walk", "--then", "3", "0.18"], "atalante walk"),
+        (["jog", "left_SK", "--to"], "atalante jog"),
+        (["guide", "check", "--push", "3"], "atalante guide check"),
+        (["dbc", "busload", "--nope"], "atalante dbc busload"),
+        (["dbc", "nope"], "atalante dbc"),
+        (["--nope"], "atalante"),
+    ],
+)
+def test_usage_error_is_one_sentence_that_names_the_called_command(arguments: list[str], command: str) -> None:
+    result = CliRunner().invoke(cli, arguments, prog_name="atalante")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("atalante: ")
+    assert result.stderr.endswith(f"; see `{command} --help`\n")
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
     ("error", "code"),
     [
         (BusAbsent("there is no interface can7"), 3),

@@ -38,6 +38,10 @@ COMMANDS = {
 }
 
 
+#: Key in `click.Context.meta` of the words of the command line after `atalante`.
+_WORDS = "atalante_tools.words"
+
+
 class Commands(click.Group):
     """Click group of all commands. The group imports a command only when the command is called."""
 
@@ -69,6 +73,36 @@ class Commands(click.Group):
             failure.show()
             raise SystemExit(failure.exit_code) from error
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the options of the group. Keep the words of the command line for `_called`, because click removes those it reads.
+
+        Raises:
+            Failed: If an option of the group is invalid. The message is one sentence.
+        """
+        ctx.meta[_WORDS] = tuple(args)
+        try:
+            return super().parse_args(ctx, args)
+        except click.exceptions.NoArgsIsHelpError:
+            raise  # no command was given: click prints the help of the group
+        except click.UsageError as error:
+            raise self._invalid(error, ctx) from error
+
+    def _invalid(self, error: click.UsageError, ctx: click.Context) -> InvalidUsage:
+        """Return the error of click as one sentence that ends with the command to get help."""
+        command_path = error.ctx.command_path if error.ctx else self._called(ctx)
+        return InvalidUsage(f"{error.format_message().rstrip('.')}; see `{command_path} --help`")
+
+    def _called(self, ctx: click.Context) -> str:
+        """Return the names of the called command. click adds no context to an error such as a missing value of an option."""
+        command: click.Command | None = self
+        names = [ctx.command_path]
+        for word in ctx.meta[_WORDS]:
+            command = command.get_command(ctx, word) if isinstance(command, click.Group) else None
+            if command is None:
+                break
+            names.append(word)
+        return " ".join(names)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command, and replace known errors by `Failed`.
 
@@ -82,8 +116,7 @@ class Commands(click.Group):
         except click.exceptions.NoArgsIsHelpError:
             raise  # no subcommand was given: click prints the help of the group
         except click.UsageError as error:
-            command_path = error.ctx.command_path if error.ctx else ctx.command_path
-            raise InvalidUsage(f"{error.format_message().rstrip('.')}; see `{command_path} --help`") from error
+            raise self._invalid(error, ctx) from error
         except Exception as error:
             failure = failure_of(error)
             if failure is None:
