@@ -133,7 +133,8 @@ def values(signal: Any, payloads: npt.NDArray[np.uint8]) -> npt.NDArray[np.float
 
 def read_log(path: Path, of: CommandLimits) -> Records:
     """Return the frames of a CAN log with the identifiers of the HAL. Shape (n,)."""
-    found = [m for m in can.LogReader(path) if m.arbitration_id in of.messages and not m.is_extended_id]
+    with can.LogReader(path) as log:
+        found = [m for m in log if m.arbitration_id in of.messages and not m.is_extended_id]
     records = np.zeros(len(found), RECORD)
     for record, message in zip(records, found, strict=True):
         record["id"], record["length"], record["flags"] = message.arbitration_id, message.dlc, FD * message.is_fd
@@ -142,11 +143,19 @@ def read_log(path: Path, of: CommandLimits) -> Records:
 
 
 def main(paths: list[str]) -> int:
-    """Check CAN logs; return 1 if a frame is outside the limits or a log has no command frame."""
+    """Check CAN logs; return 1 if a log is unreadable, violates the limits or has no command frame, and 2 if there is no log."""
+    if not paths:
+        print("usage: python tests/witness/command_limits.py LOG...", file=sys.stderr)
+        return 2
     worst = 0
     for path in paths:
         check = CommandLimits()
-        check.check(read_log(Path(path), check))
+        try:
+            check.check(read_log(Path(path), check))
+        except (OSError, ValueError) as error:  # a missing file, an unknown suffix, a line of another format
+            print(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}")
+            worst = 1
+            continue
         verdict = "ok" if check.command_frames and not check.violations else check.summary() or "no command frame in it"
         print(f"{path}: {check.command_frames} command frames: {verdict}")
         worst |= verdict != "ok"

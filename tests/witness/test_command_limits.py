@@ -113,6 +113,24 @@ def test_command_line_checks_a_can_log(
     assert "no command frame in it" in capsys.readouterr().out
 
 
+def test_call_without_a_log_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert capsys.readouterr().err == "usage: python tests/witness/command_limits.py LOG...\n"
+
+
+def test_log_that_cannot_be_read_fails_the_check_and_the_next_log_is_still_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "text.log").write_text("not a frame\n")
+    (tmp_path / "notes.md").write_text("not a log\n")
+    paths = [str(tmp_path / name) for name in ("missing.log", "notes.md", "text.log")]
+    assert main(paths) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(": ")[0] for line in lines] == paths
+    assert lines[0].endswith(": cannot be read: No such file or directory")
+    assert ".md" in lines[1]
+
+
 def test_witness_counts_frames_of_a_hal_in_this_process(make_rig: Callable[..., Any], witness: Any) -> None:
     witness.check()
     hals, frames = witness.counts
