@@ -146,6 +146,8 @@ def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
         yield f"must have an 11-bit identifier, got the 29-bit identifier {message.frame_id:#x}"
     if _attribute(message, "VFrameFormat") != _FD_FORMAT:
         yield f"must be a CAN FD frame; set VFrameFormat to {_FD_FORMAT}"
+    if message.dbc is None or "Bus" not in message.dbc.attributes:  # the default may be a bus without the sender
+        yield 'must have a Bus: add BA_ "Bus" BO_ and the number of its bus'
     if not set(message.senders) <= nodes or len(message.senders) != 1:
         yield f"must have one sender from BU_, got {', '.join(message.senders) or 'none'}"
     for name, (start, length) in E2E_HEADER.items():
@@ -188,7 +190,8 @@ def _signal_problems(message: RawMessage, signal: RawSignal, nodes: set[str]) ->
 
 def _range_problems(signal: RawSignal) -> Iterator[str]:
     if signal.minimum is None or signal.maximum is None or not signal.minimum < signal.maximum:
-        yield f"must have a range [min|max] with min < max, got [{signal.minimum}|{signal.maximum}]"
+        low, high = signal.minimum or 0, signal.maximum or 0  # cantools returns None for [0|0]
+        yield f"must have a range [min|max] with min < max, got [{low}|{high}]"
         return
     low, high = (
         (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
