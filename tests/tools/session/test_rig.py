@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -183,6 +184,26 @@ def test_signal_ends_the_run_in_hold_with_its_exit_code(network: Network, robot:
     with pytest.raises(SystemExit) as end:
         watch.conclude()
     assert end.value.code == 143
+
+
+@pytest.mark.parametrize("signals", [1, 2])
+def test_signal_ends_a_run_whose_end_condition_never_becomes_true(network: Network, robot: Robot, signals: int) -> None:
+    """The first signal leads to HOLD. With `on_stop`, the first signal calls this function, and the second leads to HOLD."""
+    sent = 0
+    stops: list[int] = []
+
+    def until(state: State) -> bool:
+        nonlocal sent
+        assert state.cycle < 2000, "the run does not end"
+        if state.supervisor is ACTIVE and sent < signals:
+            sent += 1
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    with embedded(network, robot) as rig:
+        rig.run(PoseHold(robot), until=until, on_stop=(lambda: stops.append(sent)) if signals == 2 else None)
+        assert rig.hal.state.supervisor is HOLD
+    assert (sent, stops) == (signals, [1] if signals == 2 else [])
 
 
 class LosableBus(WrappedBus):

@@ -83,9 +83,8 @@ class Rig:
         """Run the control loop on the clock of the target. The run ends in HOLD.
 
         On the wall clock, the process requests real-time priority and locked memory. After the first stop signal, the
-        HAL rejects every START and changes to HOLD. Further signals do not interrupt this change. If `on_stop` is
-        given, the first signal only calls `on_stop`, and the second signal leads to HOLD. The function `until` must
-        read the stop request.
+        HAL rejects every START and changes to HOLD, and the run ends. Further signals do not interrupt this change. If
+        `on_stop` is given, the first signal only calls `on_stop`, and the second signal leads to HOLD.
 
         Args:
             controller: Controller that computes the command of every cycle.
@@ -99,18 +98,28 @@ class Rig:
         Raises:
             Stopped: If a signal arrived before the run. The robot then did not move.
         """
-        ends = [self.hal.end] if on_stop is None else [self.hal.end, on_stop]
+        first = [] if on_stop is None else [on_stop]
+        held = False  # True after the signal that leads to HOLD
 
         def end() -> None:
-            (ends.pop() if len(ends) > 1 else ends[0])()
+            nonlocal held
+            if first:
+                first.pop()()
+            else:
+                held = True
+                self.hal.end()
+
+        def over(state: State) -> bool:
+            # The end condition of a controller may never become true in HOLD, for example a number of steps.
+            return until(state) or (held and not self.hal.moving)
 
         with ended_by(end) as stop:
             stop.check()
             if self.target.lockstep:
-                return run(self.hal, controller, LockStep(), until=until, record=record)
+                return run(self.hal, controller, LockStep(), until=over, record=record)
             for refused in realtime():
                 print_message(refused)
-            return run(self.hal, controller, WallClock(), until=until, record=record)
+            return run(self.hal, controller, WallClock(), until=over, record=record)
 
 
 @contextmanager
