@@ -5,8 +5,10 @@ from __future__ import annotations
 import datetime
 import ipaddress
 import json
+import re
 import socket
 import time
+import tomllib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -27,6 +29,7 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
 from atalante_hal.record_layout import Layout
 from atalante_hal.robot import Robot
+from atalante_hal.telemetry import access
 from atalante_hal.telemetry.access import Access, AccessError, load_telemetry_file
 from atalante_hal.telemetry.process import TelemetryConfig, TelemetryError, TelemetryProcess
 from atalante_hal.telemetry.publisher import Publisher
@@ -35,6 +38,12 @@ from atalante_tools.cli import cli
 
 TRIES = 100  # largest number of polls, one every 50 ms
 STREAMS = [("imu", "ImuStates")]
+
+
+def test_page_shows_each_key_of_the_telemetry_file() -> None:
+    page = Path(__file__).resolve().parents[3] / "docs" / "howto" / "telemetry-subscriber.md"
+    (example,) = re.findall(r"```toml\n(.*?)```", page.read_text(), re.DOTALL)
+    assert set(tomllib.loads(example)) == {*access._TEXTS, *access._FILES}
 
 
 class Authority:
