@@ -99,7 +99,7 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
     default=3_000_000,
     show_default=True,
     metavar="N",
-    help="Total number of cycles in all walks. A cycle lasts 1 ms.",
+    help="Total number of cycles in all walks, rounded up to whole walks of about 60000 cycles. A cycle lasts 1 ms.",
 )
 @jobs_option
 @dask_option
