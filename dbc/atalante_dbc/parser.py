@@ -117,6 +117,23 @@ def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
             name = f"{message.name}.{signal.name}"
             yield from ((signal_line, f"{name} {problem}") for problem in _signal_problems(message, signal, nodes))
         yield from _overlaps(message, lines)
+    yield from _sender_problems(database, lines)
+
+
+def _sender_problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
+    """Yield each message that is on another bus than the first message of its node. Only the master is on several buses."""
+    masters = {node.name for node in database.nodes if _attribute(node, "NodeKind") == "master"}
+    first: dict[str, RawMessage] = {}
+    for message in database.messages:
+        for sender in set(message.senders) - masters:
+            other = first.setdefault(sender, message)
+            bus, expected = _attribute(message, "Bus"), _attribute(other, "Bus")
+            if bus != expected:
+                yield (
+                    lines.message(message),
+                    f"{message.name} must be on the same bus as {other.name} ({expected}), because {sender} sends both, "
+                    f'got {bus}: set BA_ "Bus" BO_ {message.frame_id}',
+                )
 
 
 def _duplicates(lines: _Lines) -> Iterator[tuple[int, str]]:
@@ -146,8 +163,6 @@ def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
         yield f"must have an 11-bit identifier, got the 29-bit identifier {message.frame_id:#x}"
     if _attribute(message, "VFrameFormat") != _FD_FORMAT:
         yield f"must be a CAN FD frame; set VFrameFormat to {_FD_FORMAT}"
-    if message.dbc is None or "Bus" not in message.dbc.attributes:  # the default may be a bus without the sender
-        yield 'must have a Bus: add BA_ "Bus" BO_ and the number of its bus'
     if not set(message.senders) <= nodes or len(message.senders) != 1:
         yield f"must have one sender from BU_, got {', '.join(message.senders) or 'none'}"
     for name, (start, length) in E2E_HEADER.items():

@@ -155,7 +155,7 @@ CHANGES = {
     "length": ([("LEFT_FH_STATE: 12", "LEFT_FH_STATE: 16")], "length", "LEFT_FH_STATE", True),
     "data id": ([('"E2EDataId" BO_ 385 41345', '"E2EDataId" BO_ 385 99')], "data id", "LEFT_FH_STATE", True),
     "sender": ([("LEFT_FH_STATE: 12 LEFT_FH", "LEFT_FH_STATE: 12 LEFT_TH")], "sender", "LEFT_FH_STATE", True),
-    "bus": ([('"Bus" BO_ 385 0', '"Bus" BO_ 385 1')], "bus", "LEFT_FH_STATE", True),
+    "bus": ([('"Bus" BO_ 1792 2', '"Bus" BO_ 1792 3')], "bus", "HAL_STATUS", True),
     "cycle": ([('"GenMsgCycleTime" BO_ 385 1', '"GenMsgCycleTime" BO_ 385 2')], "timing", "LEFT_FH_STATE", True),
     "timeout": ([('"TimeoutTime" BO_ 385 5', '"TimeoutTime" BO_ 385 7')], "timing", "LEFT_FH_STATE", False),
     "inhibit": ([('"GenMsgDelayTime" BO_ 129 100', '"GenMsgDelayTime" BO_ 129 50')], "timing", "LEFT_FH_EMCY", False),

@@ -141,7 +141,7 @@ def good(tmp_path: Path) -> Path:
 def test_stop_signal_discarded_by_a_library_ends_the_command(
     command: str, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """python-can discards every exception while it imports asammdf. The command ends without a report."""
+    """A library may discard the exception of the signal. The command then ends without a report."""
     opened = log_module.open_log
 
     def discard(path: Path) -> log_module.Log:

@@ -60,7 +60,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     with _complete_file(out) as part, closing(_sink(part, out.suffix.lower(), plan)) as sink:
         for source in sources:
             for chunk in source.chunks():
-                check_stop()  # python-can and numba may discard the exception of a stop signal
+                check_stop()  # a library may have discarded the exception of a stop signal
                 for decoded in decoder.decode(chunk):
                     sink.write(decoded, source.channels.names)
                 sink.flush()

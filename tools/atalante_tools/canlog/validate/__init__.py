@@ -200,7 +200,7 @@ def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) 
         progress = Progress()
 
         def show(share: float, frames: int, path: Path = path, progress: Progress = progress) -> None:
-            check_stop()  # python-can and numba may discard the exception of a stop signal
+            check_stop()  # a library may have discarded the exception of a stop signal
             if progress.due():
                 progress.show(f"{path.name}: {100.0 * share:.0f} %, {frames} frames")
 
