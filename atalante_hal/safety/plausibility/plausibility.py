@@ -163,7 +163,9 @@ class Plausibility:
             self._check_rows()
             if (self._image.age[self._trunk_rows] <= _LATE).all():
                 self._trunk.follow()
-            if (self._image.age[self._knee_rows] <= _HELD).all():
+            # A saturated accelerometer measures only a part of an impact, and the knee checks integrate its readings.
+            clipped = not self._imus.saturated.keys().isdisjoint(KNEE_IMUS)
+            if not clipped and (self._image.age[self._knee_rows] <= _HELD).all():
                 self._knees.follow()
             else:
                 self._knees.restart()

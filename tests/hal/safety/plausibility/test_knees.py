@@ -358,3 +358,18 @@ class TestInTheCycle:
 
     def test_late_values_of_other_sensors_have_no_effect(self):
         assert self.found(late={row("left_SA"): 5, row("IMU_torso"): 5, row("foot_left"): 5})
+
+    @pytest.mark.parametrize("imu", [PELVIS, TIBIA])
+    def test_impact_beyond_the_measuring_range_is_not_reported_as_drift(self, imu: int):
+        """Each landing accelerates an IMU by 300 m/s2 for 2 ms, which saturates it, and then by -100 m/s2 for 6 ms."""
+        robot = WalkingRobot()
+
+        def land(now: Signals) -> None:
+            walk().write(now, robot.cycles)
+            since = robot.cycles % (STRIDE // 2)
+            if since < 8:
+                now.accel[imu, 0] += 300.0 if since < 2 else -100.0
+
+        for _ in range(5000):
+            robot.cycle(land)
+            assert self.nodes(robot) == set()
