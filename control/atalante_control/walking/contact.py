@@ -36,16 +36,24 @@ class ImpactConfig:
     """
 
     impact_force: float = 80.0  # N, smallest vertical force on the swing foot at an impact
-    #: N, force below which the swing foot has left the ground. An impact is accepted only after the force was below this value.
+    #: N, force below which the swing foot has left the ground. An impact with less than `certain_force` is accepted only after
+    #: the force was below this value.
     release_force: float = 30.0
     debounce: int = 5  # an impact is detected after this number of consecutive cycles with at least `impact_force`
     earliest: float = 0.5  # impacts are ignored before this fraction of the step duration
+    #: N, smallest vertical force at an impact if the swing foot has not left the ground according to its cells. The cells of a
+    #: foot in the air may report a load, for example because a strap pulls. Without this force, its landing is not noticed.
+    certain_force: float = 300.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.release_force < self.impact_force < math.inf:
             raise ValueError(
                 f"release_force must be at least 0 N and below impact_force ({self.impact_force!r} N), "
                 f"got {self.release_force!r}"
+            )
+        if not self.certain_force >= self.impact_force:
+            raise ValueError(
+                f"certain_force must be at least impact_force ({self.impact_force!r} N), got {self.certain_force!r}"
             )
         if self.debounce < 1:
             raise ValueError(f"debounce must be at least 1 cycle, got {self.debounce!r}")
@@ -61,7 +69,10 @@ class ImpactDetector:
         self.start_step()
 
     def start_step(self) -> None:
-        """Reset the detector at the start of a step. Impacts are ignored until the new swing foot has left the ground."""
+        """Reset the detector at the start of a step.
+
+        Until the new swing foot has left the ground, only impacts with at least `certain_force` are accepted.
+        """
         self._released, self._count = False, 0
 
     def update(self, vertical_force: float, phase: float) -> bool:
@@ -74,7 +85,8 @@ class ImpactDetector:
         config = self._config
         if vertical_force < config.release_force:
             self._released = True
-        if self._released and phase >= config.earliest and vertical_force >= config.impact_force:
+        least = config.impact_force if self._released else config.certain_force
+        if phase >= config.earliest and vertical_force >= least:
             self._count += 1
         else:
             self._count = 0
