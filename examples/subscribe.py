@@ -26,7 +26,12 @@ if not DESCRIPTORS.is_file():
     parser.error(f"the program must be started in the root of the project, got {Path.cwd()} without {DESCRIPTORS}")
 settings = {
     "mode": "client",
-    "connect": {"endpoints": [endpoint], "timeout_ms": -1},  # -1: no timeout, retry until the HAL answers
+    # -1: no timeout, retry until the HAL answers. The default waits up to 4 s between two attempts.
+    "connect": {
+        "endpoints": [endpoint],
+        "timeout_ms": -1,
+        "retry": {"period_init_ms": 100, "period_max_ms": 200},
+    },
     "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},  # connect to the endpoint only
     "transport": {"shared_memory": {"enabled": False}},  # off, because Ctrl-C would leave shared memory in /dev/shm
 }
