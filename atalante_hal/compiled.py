@@ -81,7 +81,8 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
 
     A call of this machine code skips numba's type dispatch, and so saves about 0.7 us for each `NamedTuple`. But it does not
     check the types: arrays with another dtype, number of dimensions or memory layout lead to undefined behaviour. So pass
-    only arrays that the caller allocated itself.
+    only arrays that the caller allocated itself, or has checked. An array that the function only reads may be read-only, also if
+    the array of the first call was writable.
 
     Args:
         function: Function to compile, see `compiled`.

@@ -40,7 +40,7 @@ from atalante_hal.safety.safety_monitor import SafetyMonitor, Verdict
 from atalante_hal.safety.start import powered, words_towards_operation
 from atalante_hal.safety.state_machine import Conditions
 from atalante_hal.transceiver import RECEIVE_BUDGET, FrameTap, Transceiver
-from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
+from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector, read_only
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
@@ -101,9 +101,8 @@ class Hal:
             network, "HAL", bus, tap, cyclic=len(self.messages), surplus=robot.thresholds.surplus_frames
         )
         self._limiter = Limiter(robot, PERIOD)
-        self._torque_sent = self.state.torque_sent = self._limiter.last.copy()
-        # Copy of the measured motion for the limiter, because a controller may write into the arrays of the state by mistake.
-        self._motion = self._parts.motion.copy()
+        self._torque_sent = self._limiter.last.copy()
+        self.state.torque_sent = read_only(self._torque_sent)
         self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
         self._errors = 0  # number of consecutive cycles in which the controller raised an exception
         self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
@@ -112,7 +111,7 @@ class Hal:
             robot,
             self._image,
             self.state,
-            self._parts.drive_side,
+            self._parts,
             self._plausibility,
             self._limiter,
         )
@@ -184,7 +183,6 @@ class Hal:
         if verdict is not None:
             self._apply(verdict)
         self._torque_sent[:] = self._limiter.last
-        self._motion[:] = parts.motion
         header = self._header
         header[CYCLE], header[TIME] = cycle, state.time
         header[FRAMES] += count
@@ -237,7 +235,7 @@ class Hal:
         if (shape := np.shape(command.torque)) != (len(JOINTS),):
             raise ValueError(f"the torque must have shape ({len(JOINTS)},), got {shape}")
         step = None if command.step is None else operator.index(command.step)
-        limited = self._limiter.apply(command.torque, self._motion)
+        limited = self._limiter.apply(command.torque, self._parts.motion)
         if not limited.finite:
             safety_monitor.report(Dtc.CMD_NONFINITE, "the commanded torque must be finite, got NaN or infinity")
             return self._commands.send_prepared_hold(self.state.cycle)
@@ -309,7 +307,7 @@ class Hal:
         on = powered(self.state.drive_state)
         torque = np.where(on, self.state.torque, 0.0)
         if on.all() and self._safety_monitor.enabling:
-            self._limiter.apply(torque, self._motion)
+            self._limiter.apply(torque, self._parts.motion)
         else:
             self._limiter.restart(torque)
             self._safety_monitor.enabling = True
@@ -319,7 +317,7 @@ class Hal:
     def _test_directions(self) -> None:
         """Limit and send the torques with which the HAL tests the direction of each joint."""
         proof = self._safety_monitor.proof
-        self._limiter.apply(proof.torque(self.state.position, self.state.velocity), self._motion)
+        self._limiter.apply(proof.torque(self.state.position, self.state.velocity), self._parts.motion)
         proof.sent(self._limiter.last)
         self._commands.torque[:] = self._limiter.last
 
@@ -341,7 +339,7 @@ class Hal:
         if self._errors > BRIDGED_ERRORS:
             safety_monitor.report(Dtc.CONTROLLER_LOST, Dtc.CONTROLLER_LOST.meaning)
         elif safety_monitor.walking:
-            self._limiter.apply(self._torque_sent, self._motion)
+            self._limiter.apply(self._torque_sent, self._parts.motion)
             self._commands.torque[:] = self._limiter.last
             return self._send_command()
         return self._commands.send_prepared_hold(self.state.cycle)

@@ -14,7 +14,7 @@ from atalante_dbc import Message
 from atalante_hal.dbc_names import FOOT_MESSAGES, IMU_MESSAGES, JOINT_MESSAGES
 from atalante_hal.record_layout import Layout
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
-from atalante_hal.types import State, SupervisorState
+from atalante_hal.types import State, SupervisorState, read_only
 from atalante_hal.wire.codec import Codec, group_of
 
 #: Names of the first fields of the record. Each field is one number.
@@ -57,10 +57,11 @@ class Record:
         assert self.drive_side.size == 2 * len(JOINTS)
         self.torque_command = self.values[self.layout["torque_command"]]
         self.level_command = self.values[self.layout["vibration_command"]]
+        self.vibration = self.values[self.layout["vibration"]]
         self.controller = self.values[self.layout["vibration_command"].stop :]
 
     def state(self, assistance_factor: float, messages: int) -> State:
-        """Create the state that a controller reads, as views of the record.
+        """Create the state that a controller reads, as read-only views of the record.
 
         Args:
             assistance_factor: Initial assistance factor Xi, 0 to 1.
@@ -69,7 +70,7 @@ class Record:
         Returns:
             State in OFF, with all messages invalid.
         """
-        values, layout = self.values, self.layout
+        values, layout = read_only(self.values), self.layout
         return State(
             cycle=0,
             time=0.0,

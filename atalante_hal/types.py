@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 Vector = npt.NDArray[np.float64]
+_Array = TypeVar("_Array", bound=npt.NDArray[Any])
 
 #: Period [s] of the SYNC message and of the control loop.
 PERIOD = 1e-3
@@ -34,6 +35,13 @@ class SupervisorState(IntEnum):
     FAULT = 7  # latched until the operator presses START
 
 
+def read_only(array: _Array) -> _Array:
+    """Return a view of an array. Writing into the view raises a ValueError."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 @dataclass(slots=True)
 class State:
     """Measured state of the robot in one cycle.
@@ -42,7 +50,7 @@ class State:
     twelve elements are in the order of `robot.JOINTS`.
 
     The arrays are views of the HAL's memory and valid until the next `Hal.read()`. Copy values that are needed longer.
-    Do not write into the arrays.
+    The arrays of `Hal.state` are read-only, because the HAL uses the same memory for its checks.
     """
 
     cycle: int  # SYNC counter

@@ -18,6 +18,7 @@ from atalante_dbc import Network
 from atalante_hal.dbc_names import IMU_NODES, JOINT_MESSAGES, JOINT_NODES, TRUNK_NODES
 from atalante_hal.leg_model import LegModel
 from atalante_hal.pendant import Pendant
+from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.direction import DirectionProof
@@ -42,7 +43,7 @@ from atalante_hal.safety.start import (
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.safety.torque_motion import TorqueMotion
 from atalante_hal.safety.torque_tracking import TorqueTracking
-from atalante_hal.types import PERIOD, State, SupervisorState, Vector
+from atalante_hal.types import PERIOD, State, SupervisorState, Vector, read_only
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
 from atalante_hal.wire.frame import Frames
@@ -101,7 +102,7 @@ class SafetyMonitor:
         robot: Robot,
         image: ReceiveImage,
         state: State,
-        drive_side: Vector,
+        record: Record,
         plausibility: Plausibility,
         limiter: Limiter,
     ) -> None:
@@ -112,16 +113,16 @@ class SafetyMonitor:
             robot: limits and thresholds of the robot.
             image: process image of the fast messages.
             state: state of the HAL; supervisor state, assistance factor and message validity are written to it.
-            drive_side: drive states and temperatures [degC] of `state` as one view, shape (24,).
+            record: record of the cycle, of which the arrays of `state` are read-only views.
             plausibility: plausibility checks, run by the HAL before `evaluate`.
             limiter: torque limiter; its torque limit is reduced when drives are hot.
         """
-        self._robot, self._image, self._state, self._drive_side = robot, image, state, drive_side
+        self._robot, self._image, self._state, self._record = robot, image, state, record
         self._plausibility, self._limiter = plausibility, limiter
         self._message_monitor = MessageMonitor(network, image)
         self._heartbeats = Heartbeats(network, robot.thresholds)
         self._pendant = Pendant(image)
-        state.valid, state.age = self._message_monitor.valid, image.age
+        state.valid, state.age = read_only(self._message_monitor.valid), read_only(image.age)
         self.memory = FaultMemory()
         self.conditions = Conditions()
         self.reason = "nothing has happened yet"
@@ -196,7 +197,7 @@ class SafetyMonitor:
             and not bus_faults
             and not found
             and pendant.signals.tobytes() == pendant.evaluated
-            and self._drive_side.tobytes() == self._drives_evaluated
+            and self._record.drive_side.tobytes() == self._drives_evaluated
         ):
             return None
         self._evaluate((*bus_faults, *found))
@@ -232,7 +233,7 @@ class SafetyMonitor:
         Returns:
             Indices in `frames` of the frames that the DBC does not define as messages to the HAL.
         """
-        unknown = self._heartbeats.accept(frames, self._state.cycle, self._state.vibration)
+        unknown = self._heartbeats.accept(frames, self._state.cycle, self._record.vibration)
         for node in self._heartbeats.booted:
             self._plausibility.reference(node)
         self._heartbeats.booted.clear()
@@ -384,7 +385,7 @@ class SafetyMonitor:
 
     def _check_drives(self, nodes_ready: bool) -> None:
         state, memory = self._state, self.memory
-        drives = self._drive_side.tobytes()
+        drives = self._record.drive_side.tobytes()
         if drives != self._drives_evaluated:
             self._drives_evaluated = drives
             self._limiter.derate(self._robot.torque_limit(state.temperature))

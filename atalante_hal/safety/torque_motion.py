@@ -252,7 +252,9 @@ class TorqueMotion:
         sample = Sample(sent, state.position, state.imu_accel, state.imu_gyro, state.foot_force, state.age, rows)
         limits = Tolerances(robot.torque_error, robot.position_min + AT_STOP, robot.position_max - AT_STOP)
         self._arguments = sample, model, limits, self._memory
-        self._check = specialised(_check, 0, *self._arguments)
+        # The arrays of the state are read-only, which is another type for numba. The code for writable arrays fits both.
+        writable = Sample._make(np.zeros_like(values) for values in sample)
+        self._check = specialised(_check, 0, writable, *self._arguments[1:])
         self.restart()
 
     def restart(self) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import itertools
 
 import numpy as np
@@ -10,10 +12,11 @@ from command_limits import database
 
 from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.hal import Hal
+from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, dtcs_of, number_of
 from atalante_hal.transceiver import RECEIVE_BUDGET
-from atalante_hal.types import Command, SupervisorState
+from atalante_hal.types import Command, State, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
@@ -211,14 +214,53 @@ def test_state_contains_the_limited_torque_of_the_last_command(rig):
     assert rig.hal.read().torque_sent.tobytes() == little.tobytes()
 
 
-def test_controller_that_writes_into_the_state_does_not_change_the_limits(rig):
+@pytest.mark.parametrize(
+    "name",
+    [field.name for field in dataclasses.fields(State) if "Vector" in str(field.type) or "NDArray" in str(field.type)],
+)
+def test_controller_cannot_write_into_the_arrays_that_the_hal_checks(name, rig):
     rig.until(S.ACTIVE)
     state = rig.hal.read()
     requested = state.torque_sent + 0.1
-    state.position += 0.5  # such as `error = state.position; error -= rest` in a controller
-    state.position[KNEE] = rig.hal.robot.position_max[KNEE] + 1.0
-    state.velocity[:] = rig.hal.robot.top_speed
+    before = getattr(state, name).copy()
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(state, name)[:] = 0
+    assert getattr(state, name).tobytes() == before.tobytes()
     assert rig.hal.write(Command(requested, np.zeros(8))).tobytes() == requested.tobytes()
+
+
+def test_controller_that_resets_the_ages_does_not_delay_a_timeout(rig):
+    """With the ages of the HAL set to 0 in each cycle, a silent drive was reported 11 cycles later."""
+
+    class Careless:
+        telemetry, telemetry_fields = np.zeros(0), ()
+
+        def reset(self, state: State) -> None:
+            rig.bus.to_hal = rig.drop(0x184)
+            self.torque = state.torque.copy()
+
+        def update(self, state: State) -> Command:
+            with contextlib.suppress(ValueError):
+                state.age[:] = 0
+            return Command(self.torque, np.zeros(8))
+
+    run(rig.hal, Careless(), LockStep(), until=lambda state: state.supervisor is S.HOLD)
+    assert rig.hal.reason == "LEFT_SK: a node timed out; its data is 5 cycles old"
+
+
+def test_write_into_the_state_leads_to_hold_with_a_reason(rig):
+    class Careless:
+        telemetry, telemetry_fields = np.zeros(0), ()
+
+        def reset(self, state: State) -> None:
+            pass
+
+        def update(self, state: State) -> Command:
+            state.position -= 0.1  # changes the array, as `error = state.position; error -= rest` does
+            return Command(state.position, np.zeros(8))
+
+    run(rig.hal, Careless(), LockStep(), until=lambda state: "CONTROLLER_ERROR" in rig.codes())
+    assert rig.hal.reason == "the controller raised ValueError: output array is read-only"
 
 
 def test_joint_outside_the_guide_is_pending_and_outside_for_long_leads_to_full_assist(rig):

@@ -58,6 +58,8 @@ class Gravity:
             articulated: model of the empty exoskeleton with the pelvis fixed.
         """
         self.links, self._torque = _links(articulated), np.zeros(len(JOINTS))
+        # Copy of the joint angles. A read-only array is another type for numba, and would be compiled in the control loop.
+        self._position = np.zeros(len(JOINTS))
         self._hold = compiled(hold)
         self.torque(np.zeros(len(JOINTS)), (1.0, 0.0, 0.0, 0.0))
 
@@ -72,7 +74,8 @@ class Gravity:
             Torques, shape (12,) [Nm]. The next call overwrites this array.
         """
         w, x, y, z = pelvis
-        self._hold(self.links, position, (w, x, y, z), self._torque)
+        self._position[:] = position
+        self._hold(self.links, self._position, (w, x, y, z), self._torque)
         return self._torque
 
 

@@ -107,6 +107,8 @@ class Pid:
         self.records: Records[PidRecord] = zeros(PidRecord, 1)
         self.limit_integral(gains.integral_limit)
         self._torque = np.zeros(n)
+        # Copies of q, qd and sent. A read-only array is another type for numba, and would be compiled in the control loop.
+        self._inputs = np.zeros(n), np.zeros(n), np.zeros(n)
         self.start_step(RIGHT, np.ones(n))
         self._kernel = compiled(control)
         self.update(np.zeros(2 * n), np.zeros(n), np.zeros(n))
@@ -149,7 +151,9 @@ class Pid:
         Returns:
             u_t, shape (12,) [Nm]. The next call overwrites this array.
         """
-        self._kernel(self.records, desired, q, qd, self.requested if sent is None else sent, self._torque)
+        for copy, values in zip(self._inputs, (q, qd, self.requested if sent is None else sent), strict=True):
+            copy[:] = values
+        self._kernel(self.records, desired, *self._inputs, self._torque)
         return self._torque
 
     @property

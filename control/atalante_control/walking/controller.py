@@ -412,7 +412,8 @@ class WalkController:
             state: measured state of the robot.
 
         Raises:
-            TypeError: If an array is not a contiguous array of float64. The kernels do not check the type.
+            TypeError: If an array is not a contiguous array of float64. The kernels do not check the type. The arrays may be
+                read-only, because the kernels do not write into them.
         """
         sent = self._sent if state.torque_sent is None else state.torque_sent
         tibiae = state.imu_gyro[_TIBIAE[0] :]
@@ -420,7 +421,8 @@ class WalkController:
             gyro, accel = state.imu_gyro[imu], state.imu_accel[imu]
             measured = Measured(state.position, state.velocity, position, gyro, accel, state.foot_force, sent, tibiae)
             for name, array, like in zip(Measured._fields, measured, self._measured, strict=True):
-                if not (array.flags.carray and array.dtype == np.float64 and array.shape == like.shape):
+                contiguous = array.flags.c_contiguous and array.flags.aligned
+                if not (contiguous and array.dtype == np.float64 and array.shape == like.shape):
                     raise TypeError(
                         f"{name} must be a contiguous array of {like.shape} float64, got {array.shape} {array.dtype}"
                     )

@@ -6,10 +6,13 @@ import math
 
 import numpy as np
 import pinocchio
+import pytest
 
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.compiled import interpreted
 from atalante_hal.robot import load_robot
+from atalante_hal.types import read_only
 
 ROBOT = load_robot()
 URDF = urdf(ExoskeletonParameters(), ROBOT)
@@ -54,6 +57,15 @@ def test_gravity_does_not_change_its_model():
     gravity = Gravity(MODEL)
     gravity.torque(np.zeros(12), (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0))
     np.testing.assert_allclose(MODEL.model.gravity.linear, [0.0, 0.0, -9.81])
+
+
+@pytest.mark.skipif(interpreted(Gravity.torque), reason="nothing is compiled")
+def test_read_only_position_is_not_compiled_again():
+    """The HAL gives read-only arrays to a controller. A compilation in the control loop would take seconds."""
+    gravity = Gravity(pinocchio_model(urdf(ExoskeletonParameters(), load_robot())))
+    known = len(gravity._hold.signatures)
+    gravity.torque(read_only(np.zeros(12)), (1.0, 0.0, 0.0, 0.0))
+    assert len(gravity._hold.signatures) == known
 
 
 def test_repeated_calls_do_not_add_up_the_force_on_the_pelvis():

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from atalante_control.joint.pid import AIR_GAINS, LEFT, RIGHT, LegGains, Pid, PidGains
+from atalante_hal.compiled import interpreted
+from atalante_hal.types import read_only
 
 RNG = np.random.default_rng(3)
 GAINS = PidGains()
@@ -114,6 +116,15 @@ def test_reset_clears_the_integral():
         pid.update(row, zero, zero)
     pid.reset()
     np.testing.assert_array_equal(pid.update(row, zero, zero), first)
+
+
+@pytest.mark.skipif(interpreted(Pid.update), reason="nothing is compiled")
+def test_read_only_state_is_not_compiled_again():
+    """The HAL gives read-only arrays to a controller. A compilation in the control loop would take seconds."""
+    pid, measured = Pid(PidGains()), read_only(np.full(12, 0.1))
+    known = len(pid._kernel.signatures)
+    pid.update(np.zeros(24), measured, measured, measured)
+    assert len(pid._kernel.signatures) == known
 
 
 def test_air_gains_of_stance_knee_and_ankle_are_swing_gains():

@@ -158,6 +158,8 @@ class HalSteps:
         self._buffer = new_frames(8)
         self._dtc = {reaction: next(d for d in Dtc if d.reaction is reaction) for reaction in Reaction}
         self._parts = self._hal._parts
+        values, layout = self._parts.values, self._parts.layout
+        self._drive_state, self._torque = values[layout["drive_state"]], values[layout["torque"]]
         self._frame = cache(self._sealed)
         #: `_receive`, `_process` and `_without_press` with a cache of all results.
         self.receive, self.without_press = cache(self._receive), cache(self._without_press)
@@ -290,7 +292,7 @@ class HalSteps:
         monitor.step, monitor._finish = None if environment.finished else 1, (1, _CYCLE + 1)
         monitor._heartbeats.all_reported = environment.nodes_ready
         if not environment.enabled:
-            hal.state.drive_state[1] = DriveState.QUICK_STOP_ACTIVE
+            self._drive_state[1] = DriveState.QUICK_STOP_ACTIVE
         findings = [
             Finding(self._dtc[environment.reaction], JOINT_NODES[0 if environment.mine else 1], 0.0, True, "input")
         ]
@@ -316,7 +318,7 @@ class HalSteps:
         if prevented:
             hal._safety_monitor.memory.raise_dtc(_CYCLE, self._dtc[Reaction.HOLD], JOINT_NODES[1])
             hal._safety_monitor.memory.close_cycle(_CYCLE)
-        hal.state.drive_state[0] = drive
+        self._drive_state[0] = drive
         if not hal.moving:
             hal.hold()
         elif controller == "raise":
@@ -342,8 +344,8 @@ class HalSteps:
         rows = len(self._image.check)
         monitor._message_monitor.qualification = [SETTLED] * rows
         monitor._message_monitor._evidence = [0] * rows
-        hal.state.drive_state[:] = DriveState.OPERATION_ENABLED
-        hal.state.torque[:] = 0.0
+        self._drive_state[:] = DriveState.OPERATION_ENABLED
+        self._torque[:] = 0.0
         self._parts.motion[:] = 0.0
         # A step must not depend on the pendant frames of an earlier step.
         monitor._message_monitor._disturbed.clear()
