@@ -32,7 +32,7 @@ from atalante_hal.record import (
     Record,
 )
 from atalante_hal.record_layout import split_bits
-from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.robot import JOINTS, MOTORS, Robot
 from atalante_hal.safety.diagnostics import Dtc, number_of
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.plausibility import Plausibility
@@ -226,7 +226,7 @@ class Hal:
             Torques that were sent, after the limits. Shape (12,) [Nm], valid until the next call.
 
         Raises:
-            ValueError: If the torques have another shape.
+            ValueError: If the torques or the vibration levels have another shape.
             TypeError: If the step is neither an integer nor None.
         """
         safety_monitor = self._safety_monitor
@@ -234,6 +234,8 @@ class Hal:
             return self.hold()
         if (shape := np.shape(command.torque)) != (len(JOINTS),):
             raise ValueError(f"the torque must have shape ({len(JOINTS)},), got {shape}")
+        if (shape := np.shape(command.vibration)) != (len(MOTORS),):
+            raise ValueError(f"the vibration must have shape ({len(MOTORS)},), got {shape}")
         step = None if command.step is None else operator.index(command.step)
         limited = self._limiter.apply(command.torque, self._parts.motion)
         if not limited.finite:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -309,6 +310,15 @@ def test_status_contains_gait_hash_and_step(make_rig):
     status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
     status_values = database().decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
     assert (status_values["GaitHash"], status_values["Step"]) == (0xCAFE, 70000 & 0xFFFF)
+
+
+@pytest.mark.parametrize("vibration", [np.zeros(7), np.zeros((2, 8)), np.zeros(()), 0.5])
+def test_vibration_of_another_shape_is_rejected(vibration, rig):
+    rig.until(S.ACTIVE)
+    rig.hal.read()
+    shape = str(np.shape(vibration))
+    with pytest.raises(ValueError, match=rf"the vibration must have shape \(8,\), got {re.escape(shape)}"):
+        rig.hal.write(Command(rig.hal.state.torque_sent, vibration))
 
 
 def test_exception_sends_the_prepared_hold_frame(rig):
