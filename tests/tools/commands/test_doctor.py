@@ -242,6 +242,15 @@ def test_the_exit_code_is_1_and_the_error_lists_failed_checks(bare: AnyMachine) 
     )
 
 
+def test_the_error_gives_the_reason_if_only_the_channel_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        machine_module, "ThisMachine", lambda: AnyMachine(opening="the channel must be a URL, got WRONG")
+    )
+    result = CliRunner().invoke(cli, ["doctor", "-i", "remote", "-c", "WRONG"])
+    assert result.exit_code == 1
+    assert result.stderr == "atalante: remote WRONG is not ready: the channel must be a URL, got WRONG\n"
+
+
 def test_json_prints_one_check_per_line(bare: AnyMachine) -> None:
     result = CliRunner().invoke(cli, ["doctor", "-i", "socketcan", "-c", "vcan0", "--json"])
     *checks, last = [json.loads(line) for line in result.stdout.splitlines()]

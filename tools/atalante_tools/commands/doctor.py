@@ -119,8 +119,11 @@ def command(interface: str, channel: str, measure: bool, seconds: float, as_json
             click.echo(line(check))
     if interface != EMBEDDED:
         _show_facts(interface, as_json)
-    if missing := [check.name for check in checks if check.needed and not check.ok]:
-        raise Failed(f"{interface} {channel}".rstrip() + f" is not ready: {', '.join(missing)}")
+    if missing := [check for check in checks if check.needed and not check.ok]:
+        names = ", ".join(check.name for check in missing)
+        # The name of the channel alone would only repeat the beginning of the sentence.
+        why = missing[0].text if names == channel else names
+        raise Failed(f"{interface} {channel}".rstrip() + f" is not ready: {why}")
     if measure:
         _measure(Target(interface, channel, lockstep=False), seconds, as_json)
 
