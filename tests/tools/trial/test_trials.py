@@ -206,6 +206,23 @@ def test_result_of_a_worker_with_other_versions_is_rejected(tmp_path: Path, monk
     assert not content(tmp_path)
 
 
+def test_result_is_serialised_once_and_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = {"trial": plan.fields(TINY[0]), "versions": plan.versions(), "curves": {10: [0.1, 1e300], 9: "\u00b0"}}
+    expected, written = json.loads(json.dumps(result)), []
+
+    def once(value: Any, *arguments: Any, **options: Any) -> str:
+        written.append(value)
+        return dumps(value, *arguments, **options)
+
+    dumps = json.dumps
+    monkeypatch.setattr(store, "_run", lambda trial: result)
+    monkeypatch.setattr(json, "dumps", once)
+    monkeypatch.setattr(json, "dump", lambda value, file: file.write(once(value)))
+    list(compute(TINY[:1], tmp_path))
+    assert sum("curves" in value for value in written) == 1
+    assert stored(TINY[0], tmp_path) == expected
+
+
 def test_treadmill_is_computed_without_a_robot() -> None:
     trial = sweep_trials(SETTING, SWEEP, 1)[0]
     result = run_trial(trial)

@@ -51,7 +51,7 @@ def stored(trial: Trial, folder: Path) -> Result | None:
     expected = json.loads(json.dumps({"trial": fields(trial), "versions": versions()}))  # JSON makes lists of tuples
     valid = (
         isinstance(result, dict)
-        and result.pop("sha256", None) == _digest(result)
+        and result.pop("sha256", None) == _digest(json.dumps(result))
         and {name: result.get(name) for name in expected} == expected
     )
     return result if valid else None
@@ -94,13 +94,13 @@ def _run(trial: Trial) -> Result:
     return {"trial": fields(trial), "versions": versions(), **run_trial(trial)}
 
 
-def _digest(result: Result) -> str:
-    """Return the SHA-256 of a result as it is after it was read from its file.
+def _digest(text: str) -> str:
+    """Return the SHA-256 of a result.
 
     Args:
-        result: result that JSON has read, without the key "sha256".
+        text: result as JSON in the order of its file, without the key "sha256".
     """
-    return hashlib.sha256(json.dumps(result, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _write(path: Path, result: Result) -> None:
@@ -108,10 +108,10 @@ def _write(path: Path, result: Result) -> None:
 
     The key "sha256" is added, so that `stored` finds a changed or missing value of any key.
     """
+    text = json.dumps(result)
     part = path.with_suffix(f".{os.getpid()}.part")
     with part.open("w") as file:
-        json.dump({**result, "sha256": _digest(json.loads(json.dumps(result)))}, file)
-        file.write("\n")
+        file.write(f'{text[:-1]}, "sha256": "{_digest(text)}"}}\n')
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
