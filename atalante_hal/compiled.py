@@ -101,7 +101,7 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
         except _numba().core.errors.NumbaError:  # raised if the function creates an array, or if the call is wrong
             pass
     code = cast(Callable[P, R], _machine_code(function, args, True))
-    if not counted:  # the function compiles only with reference counts, so it creates an array
+    if not counted:  # the compilation without reference counts has failed, so the function creates an array
         _CREATES_ARRAYS[function] = True
         _mark(function)
     return code

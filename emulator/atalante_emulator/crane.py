@@ -23,7 +23,7 @@ SPEED: Final = 0.1
 #: On the floor, the friction of the feet would prevent the motion of the legs to the standing pose.
 DELAY: Final = 2.0
 #: Stiffness and damping of the sling, per kg of robot mass.
-#: The stiffness is proportional to the mass, so every robot stretches the sling by the same length: 9.81 / 400 m = 25 mm.
+#: The stiffness is proportional to the mass, so the weight of every robot stretches the sling by the same 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
 DAMPING: Final = 28.0  # N s/m per kg
 #: Rotational stiffness and damping with which the crane turns the pelvis upright, per kg of robot mass.

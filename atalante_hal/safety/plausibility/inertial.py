@@ -270,7 +270,9 @@ def add_missed(imu: int, now: Readings, record: Record, turn: tuple[float, float
 
 
 def add_repeat(record: Record, imu: int, axis: int, same: bool, missed: float) -> None:
-    """Count a repeated reading, and add the turn that it has missed. A changed reading sets both to 0.
+    """Count a repeated reading, and add the rotation that it does not contain to the missed turn.
+
+    If the reading has changed, set the number of repeats and the missed turn to 0.
 
     Args:
         record: repeats and missed turns. Updated here.

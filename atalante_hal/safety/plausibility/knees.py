@@ -95,9 +95,9 @@ class Filters(NamedTuple):
     - d is the difference [m]: measured minus computed position of the tibia IMU.
     """
 
-    low: Vector  # (2, 33) outputs of the low-passes: for each leg, three axes with `_FILTERS` low-passes each
+    low: Vector  # (2, 33) outputs of the low-passes: one row per leg, with three axes of `_FILTERS` low-passes each
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
-    moments: Vector  # (2, 6) for each leg: running means of the products of s, g and d: ss, sg, gg, sd, gd, dd
+    moments: Vector  # (2, 6) running means of the products ss, sg, gg, sd, gd and dd: one row per leg
 
 
 class Knees:

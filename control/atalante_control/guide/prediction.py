@@ -158,10 +158,10 @@ class Prediction:
         # Example: a joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
         # `few_ahead`: largest changes of predicted torques [Nm] and speeds [rad/s] that disturbances can cause.
-        # Axis 0: 0 torque and 1 speed, both of the loop without model errors; 2 largest speed of all loops in `family`.
+        # Axis 0: torque and speed of the loop without model errors (elements 0 and 1), largest speed of all loops in `family` (2).
         # Axis 1: start of the prediction. Element k is for the start cycles k * START_CYCLES to (k + 1) * START_CYCLES - 1.
         # Axis 2: element i is for the prediction FEW[i] cycles ahead.
-        # Axis 3: 0 hip and 1 knee due to model errors; 2 hip and 3 knee due to the disturbance torques `Assumptions.promise`.
+        # Axis 3: hip and knee due to model errors (0 and 1), hip and knee due to the torques `Assumptions.promise` (2 and 3).
         few_ahead = np.zeros((3, blocks, len(FEW), 4))
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
@@ -175,7 +175,7 @@ class Prediction:
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
         # Axes 0 and 1 of `by_bound` are axes 1 and 2 of `few_ahead`.
-        # Axis 2: 0 model errors, 1 disturbance torques. Axis 3: 0 torque, 1 speed. Axis 4: 0 sagittal hip, 1 sagittal knee.
+        # Axis 2: model errors, disturbance torques. Axis 3: torque, speed. Axis 4: sagittal hip, sagittal knee.
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
