@@ -158,7 +158,7 @@ class Prediction:
         # Example: a joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
         # `few_ahead`: largest changes of predicted torques [Nm] and speeds [rad/s] that disturbances can cause.
-        # Axis 0: torque and speed of the loop without model errors (elements 0 and 1), largest speed of all loops in `family` (2).
+        # Axis 0: torque and speed of the loop without model errors (0 and 1), largest speed of all loops in `family` (2).
         # Axis 1: start of the prediction. Element k is for the start cycles k * START_CYCLES to (k + 1) * START_CYCLES - 1.
         # Axis 2: element i is for the prediction FEW[i] cycles ahead.
         # Axis 3: hip and knee due to model errors (0 and 1), hip and knee due to the torques `Assumptions.promise` (2 and 3).

@@ -171,5 +171,7 @@ def _silence(path: Path, entry: Any) -> Silence:
             f"{path}: the rule of a [[silence]] must be one of {', '.join(RULE_OF)}, got {entry.get('rule')!r}"
         )
     if not entry.get("reason", "").strip():
-        raise ProjectError(f"{path}: the [[silence]] of {entry['rule']} must have a reason, which the report shows, got none")
+        raise ProjectError(
+            f"{path}: the [[silence]] of {entry['rule']} must have a reason, which the report shows, got none"
+        )
     return Silence(entry["rule"], entry.get("message", "*"), entry["reason"])
