@@ -240,8 +240,8 @@ class _Horizon:
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
         #: Data of three upper bounds of abs(remainder): the numbers of two predicted cycles, and weights of shape (4, 2).
-        #: A bound is `errors @ weights`, for hip and knee. `errors` contains the absolute errors [rad]: of hip and knee in the first
-        #: of the two predicted cycles, then of hip and knee in the second.
+        #: A bound is `errors @ weights`, for hip and knee. `errors` contains the absolute errors [rad] of hip and knee in the
+        #: first of the two predicted cycles, then those in the second.
         self._remainders: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
