@@ -36,7 +36,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 #: Name of an empty file that marks the cache folder of a function that creates arrays.
-#: `specialised` compiles a function that creates arrays with numba's reference counting, and any other function without it.
+#: `specialised` compiles a function with numba's reference counting if the function creates arrays, otherwise without it.
 _MARK = "creates-arrays"
 #: Function given to `specialised` -> True if the function creates arrays, so that numba must count references to arrays.
 _CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
@@ -174,7 +174,7 @@ def _report_compilations(dispatcher: Any) -> None:
         """Listener of the event that numba triggers before and after each compilation."""
 
         def on_start(self, started: Any) -> None:
-            """Log the compilation, if it is not that of a function which `dispatcher` calls."""
+            """Log the compilation of `dispatcher`, but not the compilations of the functions that `dispatcher` calls."""
             if started.data["dispatcher"] is dispatcher:
                 _log.info("compiling %s.%s", dispatcher.py_func.__module__, dispatcher.py_func.__qualname__)
 

@@ -54,7 +54,7 @@ BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
 
-#: Quantities of a drive that are used even if another value in the same frame is out of range, such as an invalid position.
+#: Quantities of a drive that are used even if another value in the same frame, for example the position, is out of range.
 _INDEPENDENT = ("DriveState", "Temperature", "Torque")
 
 _S = SupervisorState

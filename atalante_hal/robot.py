@@ -66,8 +66,8 @@ class Derating:
 class Sensors:
     """Largest errors of sensors without a fault, and load thresholds of the force cells, see `plausibility`."""
 
-    #: Largest mean difference [rad/s at the joint] between a drive's reported velocity and the velocity of its encoder positions.
-    #: The velocity of the encoder positions is filtered with the same low-pass as the reported velocity.
+    #: Largest mean difference [rad/s at the joint] between reported velocity and encoder velocity of a drive.
+    #: The encoder velocity is computed from the encoder positions, and passes the same low-pass as the reported velocity.
     velocity_error: float
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass with which a drive filters its reported velocity
     #: Largest difference [rad] about each axis between the tibia attitude from the encoders and the tibia attitude from the IMUs.

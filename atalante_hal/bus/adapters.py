@@ -272,7 +272,7 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
 
 
 def reports_can_fd(interface: str) -> bool:
-    """Return whether the backend of an interface sets `can.BusABC.protocol` to CAN FD after it opened a CAN FD bus.
+    """Return whether the backend of an interface reports CAN FD in `can.BusABC.protocol` after opening a CAN FD bus.
 
     Args:
         interface: Name of the interface in python-can.

@@ -80,7 +80,7 @@ class ResilientBus(WrappedBus):
             count = super().receive(frames, timeout)
         except BusDown as error:
             self._lost(error)
-            # `JoinedBus.receive` waits for frames before it raises `BusDown`. The sleep is shorter by this waiting time [s].
+            # `JoinedBus.receive` waits for frames before it raises `BusDown`. So subtract the time `waited` [s] from the sleep.
             waited = time.monotonic() - begin
             time.sleep(max(min(timeout, RETRY_PERIOD) - waited, 0.0))
             return 0

@@ -38,9 +38,9 @@ _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit words that store the counters and flags of one bus end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
-#: A waiting bus end polls for this time [s] before it sleeps. The computing time of one control cycle is shorter.
+#: A waiting bus end polls for this time [s] before it sleeps. Computing one control cycle takes less than `_POLL_TIME`.
 _POLL_TIME = 500e-6
-#: After a wait longer than `_POLL_TIME`, the bus end sleeps at once, without polling, in this number of following waits.
+#: If a wait takes longer than `_POLL_TIME`, the bus end does not poll in this number of following waits: it sleeps at once.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.

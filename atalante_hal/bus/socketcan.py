@@ -31,7 +31,7 @@ SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
 IFF_UP: Final = 1
-#: Start of the names of virtual CAN interfaces. `ip link add` creates such an interface. For other names, an adapter is expected.
+#: Prefix of the names of virtual CAN interfaces, which `ip link add` creates. Any other name is regarded as that of an adapter.
 VIRTUAL: Final = "vcan"
 #: Classes of error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
