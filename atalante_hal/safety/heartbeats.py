@@ -88,7 +88,8 @@ class Heartbeats:
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
         #: Node -> diagnostic and error code of its active emergency. A cleared emergency is removed.
-        #: A new emergency of a node replaces its old emergency, unless its reaction is INFO or less severe than the old reaction.
+        #: A new emergency of a node replaces the old emergency of this node.
+        #: Exception: the reaction to the new emergency is INFO, or is less severe than the reaction to the old emergency.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
         self._unreported: set[str] = set()  # nodes whose active emergency `evaluate` has not reported yet

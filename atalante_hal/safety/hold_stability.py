@@ -72,7 +72,7 @@ class Measured(NamedTuple):
     torque: Vector  # torques that the drives report [Nm]
     drive_state: Vector  # states of the drives
     age: Vector  # age of these values [cycles]
-    encoder_error: Vector  # encoder angle minus angle from the IMUs [rad]; infinite if there is no such angle
+    encoder_error: Vector  # encoder angle minus angle from the IMUs [rad]; infinite if no angle from the IMUs is known
 
 
 class Swings(NamedTuple):

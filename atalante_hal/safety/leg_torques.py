@@ -31,7 +31,7 @@ HALF: Final = 8
 SPAN: Final = 2 * HALF + 1
 #: A torque in `Sample.sent` of cycle n moves the joints in cycle n + DELAY, if no frame and no motor is late.
 DELAY: Final = 1
-#: A torque may move the joints up to this many cycles later than `DELAY`, because states, commands or motors are late.
+#: A torque may move the joints up to this many cycles later than `DELAY`, because states, commands or motors may be late.
 MORE: Final = 3
 #: No torques are computed from a position that is older than this [cycles].
 #: A node that always answers one cycle late has positions of age 1. `LATE` permits this age.

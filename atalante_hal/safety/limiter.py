@@ -132,7 +132,7 @@ class Limiter:
         # Copies of the inputs, because the compiled code accepts only the array type and layout that it was compiled for.
         self._asked, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
         # First rows of `_past`: torques sent in the last `DELAY` cycles, newest first.
-        # Last two rows of `_past`: velocity that the drives reported in the last cycle, and this velocity before their low-pass.
+        # Last two rows of `_past`, both for the last cycle: reported velocity, and velocity without the low-pass of the drives.
         self._past = np.zeros((DELAY + 2, _COUNT))
         self._apply = specialised(
             limit, self._asked, self._motion, self._limits, self.limit, self.last, self._past, self.cut

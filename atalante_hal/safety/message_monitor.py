@@ -67,8 +67,9 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: Check result of a rejected frame -> diagnostic that is confirmed when the leaky bucket of this disturbance is full.
-#: The bucket fills in each cycle in which a frame of the message was rejected with this check result.
+#: Check result of a rejected frame -> diagnostic. Each message has one leaky bucket for each of these diagnostics.
+#: The bucket fills in each cycle in which a frame is rejected with a check result that leads to the diagnostic.
+#: A full bucket confirms the diagnostic.
 #: Exception: frames of an IMU with the check result INVALID lead to the diagnostic IMU_INVALID.
 _DISTURBANCES = {
     Check.REPEATED: Dtc.E2E_REPEAT_RATE,
@@ -251,7 +252,7 @@ class MessageMonitor:
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
         # `tolerance.longer` delays the timeout only in cycles without an accepted frame.
-        # With an accepted frame, the DBC timeout applies, because the plausibility checks ignore data that is at least that old.
+        # With an accepted frame, the DBC timeout applies: data that has reached this age is ignored by the plausibility checks.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

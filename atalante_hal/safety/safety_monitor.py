@@ -50,7 +50,7 @@ from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
 #: Maximum duration of FINISH_STEP [cycles].
-#: A walking robot needs less time to end its current step, make a stop step and shift its weight back.
+#: A walking robot ends its current step, makes a stop step and shifts its weight back in less than `FINISH_STEP_CYCLES`.
 FINISH_STEP_CYCLES = 6000
 
 #: If a drive does not report QUICK STOP ACTIVE within this time [cycles] after the command QUICK_STOP, the command was lost.
@@ -151,7 +151,7 @@ class SafetyMonitor:
         self.torque_motion: TorqueMotion | None = None
         #: DBC names of the drives that stay off until a start passes its direction test (attribute `proof`).
         #: 1. Drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the direction test.
-        #: 2. Drives that were off when START was pressed, if this was in READY, or if no start had passed the direction test yet.
+        #: 2. If START was pressed in READY or before any start had passed the direction test: drives that were off then.
         #: A start enables the drives in `_kept_off` for the direction test. If the start fails, they are switched off again.
         self._kept_off: set[str] = set()
         self._tested = False  # True after a start has passed the direction test
@@ -481,7 +481,7 @@ class SafetyMonitor:
         self._stalled = 0
         if not self._proof_begun:
             # The direction test starts from the torques that the HAL sent last (`limiter.last`).
-            # These torques must follow the torques that the drives report. So wait until `enabling` is True.
+            # While `enabling` is True, these torques follow the torques that the drives report. So wait until it is True.
             if not self.enabling:
                 return None
             self._proof_begun = True

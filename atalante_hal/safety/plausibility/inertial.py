@@ -99,8 +99,8 @@ class Record(NamedTuple):
     accel: Vector  # (4, 3) specific force in the last sample [m/s2]
     #: Number of samples that repeated the reading of each axis, shape (4, 6): gyroscope, then accelerometer.
     repeats: Vector
-    #: Turn of the attitude that the constant reading of each axis has missed, shape (4, 6) [rad]. If it is beyond its limit, it
-    #: stays until the reading changes or the values are too old.
+    #: Turn of the attitude that the constant reading of each axis has missed, shape (4, 6) [rad].
+    #: A missed turn beyond its limit is kept until the reading changes or the values are too old.
     missed: Vector
 
 
@@ -260,7 +260,8 @@ def add_missed(imu: int, now: Readings, record: Record, turn: tuple[float, float
         turn: angular velocity since the last sample, from the attitudes [rad/s].
         time: time since the last sample [s].
     """
-    # An IMU that repeats its attitude is at rest, or repeats all its values, which another check reports (F32).
+    # If the attitude has not changed, the IMU is at rest, or all its values are constant.
+    # Another check reports an IMU whose values are all constant (F32).
     turned = time if turn[0] != 0.0 or turn[1] != 0.0 or turn[2] != 0.0 else 0.0
     before, up = upward(record.quaternion[imu]), upward(now.quaternion[imu])
     for axis in range(3):

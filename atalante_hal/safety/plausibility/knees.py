@@ -44,7 +44,7 @@ PELVIS_IMU = (-0.164, -0.015, 0.191)
 FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
 #: Joint SH lies 0.135 m in front of joint TH, along the axis x of the transverse hip.
-#: The distance 0.135 m is equal to -x of `TRANSVERSE_HIP`, so `motion` uses x for the positions of TH and SH.
+#: This distance equals `-TRANSVERSE_HIP[0]`. So `motion` uses `TRANSVERSE_HIP[0]` for the offsets of both joints.
 TRANSVERSE_HIP = (-0.135, 0.169)
 #: Position (x, y, z) of the left tibia IMU in the axes of the tibia [m].
 #: Each coordinate has its own origin: x is relative to joint SK, y to joint SH, and z to joint SA.

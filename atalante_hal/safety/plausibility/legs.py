@@ -61,8 +61,8 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive samples after which an encoder drift is reported.
 DRIFT_SAMPLES = 4
-#: Number of samples without a comparison of a leg after one of its IMUs was silent. In this time, at least one status message of
-#: the IMU arrives (every 100 cycles), which shows whether the IMU has restarted.
+#: After an IMU of a leg was silent, the leg is not compared in this number of samples.
+#: In this time, at least one status message of the IMU (every 100 cycles) arrives, and shows whether the IMU has restarted.
 SILENT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
@@ -73,10 +73,12 @@ EXCHANGE_SAMPLES = 2
 #: Example: with encoder readings of 5 degrees (left) and 2 degrees (right), an error may deviate by 0.35 * (5 - 2) degrees.
 _AGREEMENT = 0.35
 #: The standstill check ignores a change of the error (encoder minus IMU) of up to this angle per sample [rad].
-#: `_IMU_DRIFT` applies while the gyros contradict the encoders. It is over ten times the heading drift of intact IMUs.
+#: `_IMU_DRIFT` applies while the gyros contradict the encoders.
+#: `_IMU_DRIFT` is over ten times the heading drift of intact IMUs between two samples.
 _IMU_DRIFT = 2e-5
 #: `_IMU_WANDER` replaces `_IMU_DRIFT` while the gyros agree with the encoders [rad].
-#: If each IMU has random attitude errors of 4 mrad rms (time constant 10 s), the error changes by 0.11 mrad rms in 16 cycles.
+#: Emulated IMUs have random attitude errors of 4 mrad rms (time constant 10 s), interpolated over 128 cycles.
+#: These attitude errors change the error (encoder minus IMU) by 0.11 mrad rms in 16 cycles.
 _IMU_WANDER = 2e-4
 #: The gyros agree with the encoders about an axis if the two angular velocities differ by at most this value [rad/s].
 #: `_GYRO_ERROR` is 3.6 times the rms noise of the difference of two gyros.
@@ -135,7 +137,7 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
-        #: For each leg: estimated heading of the pelvis IMU minus heading of the tibia IMU [rad].
+        #: For each leg: estimated heading drift [rad]. It is the heading of the pelvis IMU minus the heading of the tibia IMU.
         self._heading_drift = [0.0 for _ in SIDES]
         #: For each leg: errors of the last comparison [rad]; None before the first comparison.
         self._errors: list[tuple[float, float, float] | None] = [None for _ in SIDES]

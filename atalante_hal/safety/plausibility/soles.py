@@ -27,8 +27,9 @@ from atalante_hal.wire.process_image import NEVER
 SOLE_SAMPLES = 4
 #: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free` (largest force of an unloaded cell).
 _LOAD = 4.0
-#: Largest distance of the centre of pressure from the middle of a flat foot, along and across the foot. Both are multiples of the
-#: distance of a force cell from the middle in the same direction. The edge of the sole is at 1.1 along the foot, at 2.0 across.
+#: Largest distance of the centre of pressure from the middle of a flat foot: along the foot, across the foot.
+#: Each value is a multiple of the distance between the middle and a force cell in this direction.
+#: The edge of the sole is at the multiple 1.1 along the foot, and at the multiple 2.0 across the foot.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)

@@ -54,7 +54,7 @@ _DRIVEN = 1e-5
 #: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since then.
 #: If the last forces of a foot are older than `_FORCES_VALID`, the `Drive` records of its ankles are cleared.
 _FORCES_VALID = 5
-#: Limit of the repeated readings of a signal that may be constant forever [samples].
+#: Number of repeated readings [samples] that is never reached: the limit for signals that may stay constant.
 _NO_LIMIT = 1 << 30
 #: Index of each ankle joint in JOINTS.
 _ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
