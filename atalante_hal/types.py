@@ -107,11 +107,12 @@ class Command:
     #: While `outside` and `guide_left` are True, GUIDE_OUTSIDE is confirmed, and the state FULL_ASSIST follows.
     guide_left: bool = False
     #: True if a step starts with a larger deviation than the certificate of the guide was calculated for.
-    #: The deviations at the start of the step are those of angle, speed and acceleration, and the torque jump.
+    #: Four quantities at the start of the step are checked: angle deviation, speed deviation, acceleration and torque jump.
     #: If `hand_over_exceeded` is True, the HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not react to it.
     hand_over_exceeded: bool = False
-    #: True in the cycle in which a step starts without a guide, or its guide ends early, because the delay of the loop is longer
-    #: than guides cover. The HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not react to it.
+    #: True in the cycle in which a step starts without a guide, or in which its guide ends early. The cause is a delay of the
+    #: loop for which the guides are not designed. The HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not
+    #: react to it.
     loop_late: bool = False
 
 

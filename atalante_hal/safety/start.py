@@ -27,13 +27,13 @@ ENABLE_CYCLES = 200
 #: Even if four consecutive commands and then four consecutive answers of a drive are lost, the start does not end.
 STALLED_CYCLES = 10
 #: Largest speed of a joint at which START is accepted in HOLD [rad/s]. The test of the joint directions needs joints at rest.
-#: A joint whose drive is off may be faster, because it sinks. The start first lets its drive stop and hold the joint.
+#: A joint whose drive is off may be faster, because it sinks. After START, its drive first stops the joint and holds it.
 AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
 #: Reason of a HOLD that the program requests because it is ending.
 PROGRAM_ENDS = "the program is ending"
-#: If the operator ends a walk on the ground, the reason of FINISH_STEP ends with this text. The next HOLD keeps the reason.
+#: Suffix of the reason of FINISH_STEP if the operator requests the end of a walk on the ground. The next HOLD keeps the reason.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START acknowledges faults, but enables no drive.

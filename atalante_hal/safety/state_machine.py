@@ -20,7 +20,7 @@ class Conditions:
     diagnostics: frozenset[Dtc] = frozenset()
     nodes_ready: bool = False  # every required node is trusted and has sent its status
     #: True if all twelve drives are in OPERATION ENABLED and the direction test of the joints has ended.
-    #: In FULL_ASSIST, there is no direction test: True if all twelve drives are in OPERATION ENABLED.
+    #: In FULL_ASSIST, only the states of the drives count, because there is no direction test.
     drives_enabled: bool = False
     dead_man: bool = False  # the pendant has not timed out and its dead-man switch is pressed
     #: True if HOLD is requested, if STOP is requested outside a walk on the ground, or if the program is ending.

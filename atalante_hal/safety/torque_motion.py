@@ -76,8 +76,10 @@ PAUSE: Final = 5
 _PEAK_SHARE: Final = 0.8
 #: Factor by which each check with a deviation reduces `Deviations.peak`, so that an old maximum is forgotten.
 _PEAK_DECAY: Final = 0.97
-#: A motor is suspected only if the decaying number of its checks (element 0 of `Deviations.sums`) is at least this value.
-#: Three checks are enough: their decaying number is at least 1 + 0.8 + 0.8^2 = 2.44. Two checks reach at most 1 + 0.96 = 1.96.
+#: A motor is suspected only if the weighted number of its checks is at least this value.
+#: The weighted number is `Deviations.sums[window, joint, 0]`: each check adds 1, and older checks count less.
+#: Three checks are enough: their weighted number is at least 1 + 0.8 + 0.8^2 = 2.44.
+#: Two checks are not enough: their weighted number is at most 1 + 0.96 = 1.96.
 _LEAST_WEIGHT: Final = 2.4
 _LEG: Final = len(LEG_JOINTS)
 
@@ -85,7 +87,7 @@ _LEG: Final = len(LEG_JOINTS)
 class Tolerances(NamedTuple):
     """Properties of the joints that the check uses. Each field has the shape (12,)."""
 
-    error: Vector  # Nm rms, error with which the motion gives the produced torque
+    error: Vector  # Nm, rms error of the produced torque, which is computed from the motion
     low: Vector  # rad, position below which a joint is at its lower end stop
     high: Vector  # rad, position above which a joint is at its upper end stop
 
@@ -252,7 +254,8 @@ class TorqueMotion:
         sample = Sample(sent, state.position, state.imu_accel, state.imu_gyro, state.foot_force, state.age, rows)
         limits = Tolerances(robot.torque_error, robot.position_min + AT_STOP, robot.position_max - AT_STOP)
         self._arguments = sample, model, limits, self._memory
-        # The arrays of the state are read-only, which is another type for numba. The code for writable arrays fits both.
+        # The arrays of the state are read-only. For numba, read-only and writable arrays have different types.
+        # `_check` is compiled for writable arrays. This machine code also accepts read-only arrays, see `specialised`.
         writable = Sample._make(np.zeros_like(values) for values in sample)
         self._check = specialised(_check, 0, writable, *self._arguments[1:])
         self.restart()

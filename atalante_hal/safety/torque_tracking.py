@@ -27,7 +27,7 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 
 #: Longest time from sending a torque to the report of this torque by the drive [cycles].
-#: `SPAN` is the sum of 4 cycles with lost commands, a delay of the drive's frame of 4 cycles, and 4 cycles without faults.
+#: The time is 4 cycles without faults, plus 4 cycles if commands are lost, plus 4 cycles if the frame of the drive is late.
 #: Without faults, the drive applies a command one cycle after the HAL sent it. The torque follows within two more cycles, and
 #: the drive reports it in the next cycle.
 SPAN: Final = 12

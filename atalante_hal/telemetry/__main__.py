@@ -166,7 +166,7 @@ def _print_line(line: dict[str, Any]) -> None:
 
 
 def _leave_realtime() -> None:
-    """Return to normal scheduling, because this process inherits the real-time scheduling of the control loop."""
+    """Switch to normal scheduling, because this process inherits the real-time scheduling of the control loop."""
     if os.sched_getscheduler(0) != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

@@ -48,7 +48,8 @@ _KILLED = 0.1
 _SESSION_END = 2.0
 #: A restarted subprocess that is not ready after this time [s] is ended. Then `tend` restarts the subprocess again.
 _RESTART = 30.0
-#: On the wall clock, the first subprocess is ended if it is not ready after this time [s]. Then `tend` starts a new subprocess.
+#: Time limit for the start of the first subprocess on the wall clock [s].
+#: A subprocess that is not ready after this time is ended. Then `tend` starts a new subprocess.
 #: A run may begin before the subprocess is ready, see `TelemetryProcess.start`.
 _JOIN = 60.0
 
@@ -107,7 +108,7 @@ class TelemetryConfig:
 
     @property
     def requires_publisher(self) -> bool:
-        """Return whether a session without a publisher is an error: an endpoint, TLS or users were requested."""
+        """Return whether the session must have a publisher: publishing with an endpoint, TLS or users was requested."""
         return self.publish and (self.listen is not None or self.access != Access())
 
     def to_json(self) -> dict[str, Any]:
@@ -423,7 +424,7 @@ class TelemetryProcess(Closing):
         self._runs += 1
 
     def write(self, record: memoryview | npt.NDArray[np.float64]) -> None:
-        """Copy the record of a cycle to the ring, on the wall clock with the time of day.
+        """Copy the record of a cycle to the ring. On the wall clock, add the time of day.
 
         Args:
             record: Values of the record, shape (layout.size,). A memoryview is copied fastest.

@@ -23,7 +23,7 @@ from atalante_hal.telemetry.process import CYCLE_NS
 from atalante_hal.telemetry.ring import RingReader
 from atalante_hal.telemetry.sink import EVENTS, MessageSink, SinkError
 
-if TYPE_CHECKING:  # only for type checks, because protobuf and python-can may not be installed
+if TYPE_CHECKING:  # only for type checks, because protobuf and mcap are optional packages
     from atalante_hal.telemetry.can_log import CanLog
     from atalante_hal.telemetry.messages import Encoder
     from atalante_hal.telemetry.recorder import Recorder
@@ -87,7 +87,7 @@ class Service:
         self._lost, self._lost_reported = 0, -math.inf
         self._recorder, self._saved = recorder, 0  # `_saved`: last seen value of `recorder.saved` (messages on disk)
         self._handled = 0  # number of records whose messages have been passed to all sinks
-        self._kept = 0  # number of records that this service has reported as saved with `RingReader.keep`
+        self._kept = 0  # number of saved records that this service has reported by `RingReader.keep`
         self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:

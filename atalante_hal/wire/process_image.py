@@ -95,7 +95,7 @@ class E2EState(NamedTuple):
     spans: Words  # (rows, 3) begin and end of the payload [bytes] and Data ID, see `e2e.protected_spans`
     expected: Words  # (rows,) expected counter of the next frame; `NOTHING` before the first frame
     silent: Words  # (rows,) cycles since the last change of the expected counter
-    kept: Octets  # (rows * 72,) last frame with correct format and CRC whose counter was accepted, see `classify_frame`
+    kept: Octets  # (rows * 72,) last frame with correct format, correct CRC and accepted counter, see `classify_frame`
 
 
 class RowStatus(NamedTuple):
@@ -153,7 +153,7 @@ class ReceiveImage:
         is_independent = np.array([group_of(signal.name) in independent for _, signal in self.codec.signals])
         #: Indices of the independent signals of each row in `values`.
         self._independent = [np.flatnonzero(is_independent & (self.codec.row_of == row)) for row in range(count)]
-        #: For each row, the last frame with correct format and CRC whose counter was accepted, see `classify_frame`.
+        #: For each row, the last frame with correct format, correct CRC and accepted counter, see `classify_frame`.
         self.frames = self.codec.template()
         self._e2e = E2EState(
             headers=as_words(self.frames)[:, 0].astype(np.int64),
@@ -324,7 +324,7 @@ class ReceiveImage:
         )
         self._offered = frames, found
         foreign = []
-        outside: dict[int, int] = {}  # row -> index of its last frame that was rejected only because of a range
+        outside: dict[int, int] = {}  # row -> index of its last frame that was rejected only for a value out of range
         for index, (row, check, passive) in enumerate(found.tolist()):
             if row == _FOREIGN:
                 foreign.append(index)
@@ -337,7 +337,7 @@ class ReceiveImage:
                 if check in _OUT_OF_RANGE:
                     outside[row] = index
         for row, index in outside.items():
-            if self.check[row] > _FRESH:  # keep the values of another frame of the row that was accepted in this cycle
+            if self.check[row] > _FRESH:  # no other frame of this row was accepted in this cycle
                 self._commit_independent(frames, index, row)
         return foreign
 
@@ -628,7 +628,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # `specialised` runs `seal` once with the counter 0xFF. The next counter is 0, so the first frame that is sent has 0.
+        # `specialised` runs `seal` once with the counter 0xFF. The next counter is 0. The first sent frame has this counter.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 
