@@ -29,7 +29,7 @@ class AirwalkConfig(StepGuideConfig):
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait
     #: s, fade-out time of the torque that prevents a jump at a stance change (`carry_over`); with 0, the torque can jump
     blend: float = 0.02
-    #: s, fade-out time of the torque that prevents a jump of the torque of sagittal hip and knee in a leg with a guide.
+    #: s, fade-out time as `blend`, but for sagittal hip and knee of a leg with a guide.
     #: The certificate of the guide assumes the fade-out time `guided_blend`.
     guided_blend: float = 0.006
 

@@ -310,7 +310,7 @@ class AirwalkController:
         if xi < 1.0 and self._loop_delay.confirmed:
             self._command.loop_late, xi = True, 1.0
             self.statistics.late += 1
-        else:  # The factor 1 of a late step is no choice of the operator.
+        else:  # Count only factors set by the operator, not the factor 1 that the controller sets if the loop is late.
             self.statistics.factors.add(xi)
         self._assisting = xi < 1.0
         leg = _LEG * (1 - stance)

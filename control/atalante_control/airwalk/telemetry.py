@@ -25,7 +25,8 @@ class Telemetry:
     error: Annotated[Vector, 2]  # rad, q - q_des
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound: upper bound if error > 0, else lower
     guide: Annotated[Vector, 2]  # rad, distances from q_des to upper and lower guide bound of the hip
-    #: safety value h of the guide filter, equal for hip and knee; h >= 0: the backup policy can keep both inside the guide
+    #: safety value h of the guide filter, equal for hip and knee.
+    #: If h >= 0, the backup policy can keep both joints inside the guide.
     h: Annotated[Vector, 2]
     gate: Annotated[Vector, 2]  # weight of the backup torque, the same value for both joints; published as `lambda`
     filter_active: Annotated[Vector, 2]  # 1 while the guide filter is active, else 0; the same for both joints

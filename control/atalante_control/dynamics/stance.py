@@ -62,7 +62,7 @@ class StanceDynamics:
         pinocchio.forwardKinematics(self._fixed.model, self._data[1], pinocchio.neutral(self._fixed.model))
         pinocchio.updateFramePlacement(self._fixed.model, self._data[1], self._foot)
         #: Rotation matrix from the stance foot to the world: the foot points outwards by the toe-out angle during the whole step.
-        #: The matrix is computed with all joints at 0 rad, where the pelvis has the axes of the world (x forward).
+        #: The matrix is computed with all joints at 0 rad, and with the pelvis axes parallel to the world axes (x forward).
         self._toe_out = self._data[1].oMf[self._foot].rotation.copy()
 
     def forces(self, position: Vector, velocity: Vector, acceleration: Vector) -> GroundForces:

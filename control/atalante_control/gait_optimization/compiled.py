@@ -20,7 +20,8 @@ from atalante_control.gait_optimization.nlp import Functions
 
 COMPILER = "gcc"
 #: Compiler options. With -O0, the functions (60,000 C statements) compile in 13 s and run 4 times as fast as in the interpreter.
-#: With -O1, the functions would compile in 95 s and run twice as fast as with -O0. The solver would take only 10 % less time.
+#: With -O1, the functions would compile in 95 s and run twice as fast as with -O0.
+#: But the solver would take only 10 % less time than with -O0.
 #: -ffp-contract=off disables fused multiply-adds.
 #: Without fused multiply-adds, the compiled functions round after each multiplication, as the interpreter does.
 OPTIONS = ("-O0", "-fPIC", "-shared", "-ffp-contract=off")

@@ -21,7 +21,7 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: Part of the message of dask if the scheduler cannot load the calls. The scheduler imports the function of a call.
+#: Part of dask's error message if the scheduler cannot load the calls. To load a call, the scheduler imports its function.
 _FOREIGN: Final = "Error during deserialization of the task graph"
 #: Longest time in which the first worker must connect to the scheduler [s].
 _WORKER_TIMEOUT: Final = 10.0
@@ -222,7 +222,7 @@ def _on_cluster(
             ) from error
         except CancelledError as error:
             raise FanOutError(
-                f"the connection to the dask scheduler at {address} is lost; repeat the command when it runs again"
+                f"the connection to the dask scheduler at {address} is lost; repeat the command when the scheduler runs again"
             ) from error
         finally:
             with suppress(Exception):  # after a lost connection, nothing can be cancelled
@@ -250,7 +250,7 @@ def _client(address: str) -> Iterator[Any]:
         raise FanOutError("--dask needs dask: install it with `pip install 'atalante-hal[dask]'`") from error
     try:
         client = Client(address, timeout=_CONNECT_TIMEOUT)  # type: ignore[no-untyped-call]
-    except (OSError, TimeoutError, TypeError, ValueError) as error:  # TypeError: no certificate of tls://
+    except (OSError, TimeoutError, TypeError, ValueError) as error:  # TypeError: no certificate for tls://
         raise FanOutError(
             f"no dask scheduler responds at {address} ({error}): start one with `dask scheduler`"
         ) from error

@@ -17,7 +17,7 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-#: The search accepts a landing pose if each joint is less than this angle outside its range [rad].
+#: The search accepts a landing pose if no joint is outside its range by this angle or more [rad].
 #: Near such a pose, the optimiser can still find a pose with all joints inside their ranges.
 _TOLERANCE = math.radians(0.5)
 _CENTRE_WEIGHT = 1e-6  # weight of (joint angle - middle of the range)^2; the weight of (angle outside the range)^2 is 1

@@ -191,7 +191,7 @@ def test_lost_scheduler_gives_one_sentence() -> None:
         results = fan_out(slow, [0.0, 600.0], cluster=cluster.scheduler_address)
         next(results)
         cluster.close()
-        with pytest.raises(FanOutError, match=r"is lost; repeat the command when it runs again$"):
+        with pytest.raises(FanOutError, match=r"is lost; repeat the command when the scheduler runs again$"):
             next(results)
 
 
