@@ -92,7 +92,8 @@ class Certificate:
     reason: str  # sentence that states what limits the certified torques, or why there are none
     #: certified disturbance torques, which the running filter assumes; None if no torques are certified
     promise: JointTorque | None
-    #: largest disturbance torques that meet all conditions with these gains, at least `promise`; None if no torques are certified
+    #: Largest disturbance torques that meet all conditions with these gains. They are equal to `promise` or larger.
+    #: None if no torques are certified.
     largest: JointTorque | None
     #: smallest fraction of the guide width that remains free under the certified torques; -inf if no torques are certified
     margin: float
@@ -239,7 +240,7 @@ class _Horizon:
         # Split the error one cycle after the prediction: factor * (error in the last predicted cycle) + remainder.
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Data of three upper bounds of abs(remainder): the numbers of two predicted cycles, and weights of shape (4, 2).
+        #: Data of three upper bounds of abs(remainder): the indices of two predicted cycles, and weights of shape (4, 2).
         #: A bound is `errors @ weights`, for hip and knee. `errors` contains the absolute errors [rad] of hip and knee in the
         #: first of the two predicted cycles, then those in the second.
         self._remainders: list[tuple[tuple[int, int], Vector]] = []

@@ -33,7 +33,8 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 #: Approximate maximum spacing of the grid of knee angles for which the mass matrix is evaluated in each cycle [rad].
-#: Near the start of a step, the spacing may be larger, because the start deviation widens the grid but adds no angles.
+#: Near the start of a step, the spacing may be larger. The start deviation widens the range of the grid, and the number of
+#: knee angles in the grid stays the same.
 _SPACING = math.radians(7.5)
 
 
@@ -245,8 +246,8 @@ class Effect(NamedTuple):
     #: For a torque, `pushed` contains an acceleration, which the mass matrices `left` convert to the torque.
     #: For a torque change, `pushed` contains a change of the acceleration, which `left` converts to the torque change.
     pushed: Vector
-    #: (n, 2, 2) hidden[i]: change of the value predicted i cycles ahead, because the start velocity is measured wrongly.
-    #: The change is for the error of the start velocity that an acceleration of 1 rad/s2 causes.
+    #: (n, 2, 2) hidden[i]: effect of a wrong start velocity on the value that is predicted i cycles ahead.
+    #: The start velocity has the measurement error that a joint acceleration of 1 rad/s2 causes.
     #: An empty array of shape (0, 2, 2) means that the start velocity is assumed to be exact.
     hidden: Vector
     #: Shape (n, 2, 2). The changes of the quantity in cycle k of the step are left[k] @ pushed[i] and left[k] @ hidden[i].

@@ -14,8 +14,8 @@ from atalante_hal.types import State
 
 #: Largest additional delay that the certificate of a guide covers [cycles].
 COVERED: Final = DELAYS[1] - DELAYS[0]
-#: The delay counts as uncovered for good after this number of consecutive cycles. Single lost frames also make the data old, but
-#: are harmless. The HAL tolerates the loss of up to a fifth of the frames.
+#: The delay is confirmed as uncovered after this number of consecutive cycles in which the certificate does not cover it.
+#: A single lost frame also makes the data old, but does no harm. The HAL tolerates the loss of up to a fifth of the frames.
 _CONFIRM: Final = 5
 # Indices in JOINTS of the joints with a guide: sagittal hip and knee of both legs.
 _LEFT_SH, _LEFT_SK, _RIGHT_SH, _RIGHT_SK = (JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SH", "SK"))
@@ -29,7 +29,7 @@ class LoopDelay:
     """
 
     def __init__(self) -> None:
-        self._at_start = 0  # additional delay at START without the ages of the data [cycles]
+        self._at_start = 0  # additional delay at START minus the largest age of the data at START [cycles]
         self._uncovered = 0  # number of consecutive cycles with an uncovered delay
 
     def reset(self, state: State) -> None:
@@ -62,7 +62,7 @@ class LoopDelay:
 
     @property
     def confirmed(self) -> bool:
-        """Return whether the delay was uncovered in several consecutive cycles up to the last counted cycle."""
+        """Return whether the last `_CONFIRM` counted cycles, or START and all cycles since then, had an uncovered delay."""
         return self._uncovered >= _CONFIRM
 
 

@@ -1,4 +1,4 @@
-"""Statistics of the virtual guide over a walk: `error as a ratio, safety value h (each cycle) -> counts, extremes`."""
+"""Statistics of the virtual guide over a walk: `|e| / q_bound and h of each cycle -> counts, extremes`."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ class GuideStatistics:
     hand_overs: int = 0  # number of steps whose start was compared with the hand-over box
     #: Number of compared steps that start outside the hand-over box (`HandOver`). The certificate does not apply to them.
     hand_overs_exceeded: int = 0
-    late: int = 0  # number of steps whose guide did not act, or not to the end, because of the delay of the loop
-    #: Assistance factors of all steps so far. A step that has no guide because the loop is late (`late`) adds no factor.
+    #: number of steps in which the delay of the loop was too long, so the guide did not act or ended early
+    late: int = 0
+    #: Assistance factors of the steps so far. A step that has no guide because the loop is late (`late`) adds no factor.
+    #: In a walk on the ground, only steps that start with a guide add a factor.
     factors: set[float] = field(default_factory=set)
 
     @property

@@ -34,7 +34,7 @@ Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
 _STOP_MARGIN = math.radians(1.0)  # rad, smallest distance between a target and the joint limit
-#: rad, distance from a target to its limit (`Ankle.low`, `Ankle.high`) below which the rate of the target is reduced
+#: rad, width of the range next to a limit (`Ankle.low`, `Ankle.high`) in which the rate of a target is reduced
 _STOP_FADE = math.radians(3.0)
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
