@@ -54,8 +54,8 @@ class WalkConfig:
     """
 
     gains: PidGains = WALK_GAINS
-    #: Loss of the derivative gains of the stance leg (SH, SK, SA) for each cycle by which torques act late (`State.delay`).
-    #: With a delay of d cycles, the gains are multiplied by 1 - damping_loss * d. Example: 0.75 for 3 cycles.
+    #: Fraction by which each cycle of delay (`State.delay`) reduces the derivative gains of the stance leg (SH, SK, SA).
+    #: With a delay of d cycles, the gains are multiplied by 1 - damping_loss * d. Example: 1 - 3/12 = 0.75 for d = 3.
     #: With full gains and a delay of 3 cycles, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
@@ -90,7 +90,7 @@ class WalkConfig:
     steering: tuple[float, float, float] = STEERING
     #: rad, angle by which the straight path of the robot turns before each periodic step, positive to the left
     turn: float = 0.0
-    #: s, time after the nominal end of a step at which the step ends if no landing is detected
+    #: s, longest wait for a landing after the nominal end of a step. Then the step ends without a detected landing.
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
@@ -130,8 +130,8 @@ class WalkConfig:
         controller has no gravity torque, no feedforward, no ankle stabiliser and no steering. Below Xi = 1,
         `guide.literal` drives SH and SK of the swing leg. Standing, weight shifts, start step and stop step follow the default
         law, because the paper does not define these phases. The PID gains with integral apply in all phases. The integral is
-        not limited in the periodic steps, and at most 10 Nm in the other phases. The ankle has no offset of one degree, as in
-        the default walk.
+        not limited in the periodic steps, and at most 10 Nm in the other phases. The ankle offset of one degree is
+        left out, as it is in the default walk.
         """
         return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
 

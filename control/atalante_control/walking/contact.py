@@ -36,13 +36,14 @@ class ImpactConfig:
     """
 
     impact_force: float = 80.0  # N, smallest vertical force on the swing foot at an impact
-    #: N, force below which the swing foot has left the ground. An impact with less than `certain_force` is accepted only after
-    #: the force was below this value.
+    #: N, the swing foot has left the ground when its vertical force is below `release_force`.
+    #: Until then, only an impact with at least `certain_force` is accepted.
     release_force: float = 30.0
     debounce: int = 5  # an impact is detected after this number of consecutive cycles with at least `impact_force`
     earliest: float = 0.5  # impacts are ignored before this fraction of the step duration
-    #: N, smallest vertical force at an impact if the swing foot has not left the ground according to its cells. The cells of a
-    #: foot in the air may report a load, for example because a strap pulls. Without this force, its landing is not noticed.
+    #: N, smallest vertical force at an impact if the force of the swing foot was never below `release_force` in this step.
+    #: Such a foot may still be in the air: its cells report a load, for example because a strap pulls.
+    #: Without `certain_force`, the landing of such a foot would not be detected.
     certain_force: float = 300.0
 
     def __post_init__(self) -> None:

@@ -72,8 +72,8 @@ SENSOR_AGE = 10
 #: Largest expected difference between the weight and the load on the stance foot, as a fraction of the weight.
 #: While one foot swings, the load on the stance foot differs from the weight, because the robot accelerates.
 _LOAD_ERROR = 0.15
-#: s, time constant with which the stance leg corrects the attitude after a trunk IMU was implausible. A correction
-#: in one cycle can move the ankles of the swing foot, which is held level, faster than their velocity limit.
+#: s, time constant with which roll and pitch approach the values computed from the stance leg, if a trunk IMU was implausible.
+#: With a correction in a single cycle, the ankles that hold the swing foot level could exceed their velocity limit.
 _LEVEL_TIME = 0.02
 #: m, height above the stance foot up to which the swing foot counts as landed while the data of both feet is lost
 _LANDED_HEIGHT = 0.001
@@ -652,7 +652,7 @@ def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:
     """
     low, high = robot.position_min + _MARGIN, robot.position_max - _MARGIN
     low[[_SK, _LEG + _SK]] = config.reach_knee
-    # The transverse hip may use its full range. Steering without a turn already moves it to 0.4 degrees from a position limit.
+    # The transverse hip may use its full range. Even without a turn, steering moves it to within 0.4 degrees of a limit.
     turning = [_TH, _LEG + _TH]
     low[turning], high[turning] = robot.position_min[turning], robot.position_max[turning]
     return low, high

@@ -84,7 +84,7 @@ class Stage:
     #: True: the virtual guide drives sagittal hip and knee of the swing leg, so the patient can move them within bounds.
     #: False: the baseline controller (PID) drives all joints, for example at assistance factor 1 or in the start step.
     assisted: bool
-    #: Last cycle of the step in which the guide acts: the nominal end of the step, or earlier if the loop is too slow.
+    #: Last cycle in which the guide acts: the nominal end of the step, or earlier if the loop is too slow.
     last_guided: int
     intensity: float  # factor from 0 (off) to 1 on the levels of the vibration motors
     #: Nm, torque of the virtual guide minus torque of the baseline controller, in the last cycle with the guide.
@@ -186,7 +186,7 @@ def sense(measured: Measured, constants: Constants, stabiliser: Stabiliser, part
     suspended = stage.double and load[0] + load[1] < 0.1 * constants.weight
     velocity = (0.0, 0.0, 0.0) if suspended else _velocity(measured.imu, sole.position, sole.linear, gyro)
     if stage.gyro_source != TRUNK:
-        # Without an accelerometer, the attitude is the integral of the angular velocity: the velocity error must be 0.
+        # No accelerometer of the trunk is in use. With a velocity error of 0, `observe` only integrates the angular velocity.
         for k in range(3):
             parts.attitudes[0].velocity[k] = velocity[k]
     observe(parts.attitudes, gyro, measured.accel, velocity)

@@ -79,7 +79,9 @@ class PlacementConfig(NamedTuple):
     #: The needed landing offset may exceed the limits `forward`, `outward` and `inward`.
     #: `_cost` multiplies the squared excess by this weight.
     missed: float = 30.0
-    timing: float = 0.03  # m, weight in `_cost` of a landing before or after the nominal time
+    #: m, weight in `_cost` of a change dt of the landing time.
+    #: The change costs as much as a landing offset of `timing` * w * dt, where w is the natural frequency.
+    timing: float = 0.03
     #: s, time in which the goal of the swing leg changes from joint angles to foot positions, after the first reaction to a push.
     #: The foot positions are relative to the stance foot, so a tilt of the pelvis does not move the swing foot.
     hold: float = 0.1
