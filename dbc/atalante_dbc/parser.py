@@ -121,7 +121,7 @@ def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
 
 
 def _sender_problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Yield each message that is on another bus than the first message of its node. Only the master is on several buses."""
+    """Yield each message that is not on the bus of its sender's first message. Only the master may send on several buses."""
     masters = {node.name for node in database.nodes if _attribute(node, "NodeKind") == "master"}
     first: dict[str, RawMessage] = {}
     for message in database.messages:

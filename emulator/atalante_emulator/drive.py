@@ -54,10 +54,10 @@ class DriveParameters:
     cool_enough: float = 100.0
     supply: float = 48.0  # nominal supply voltage [V]
     hold_below: float = 40.0  # below this supply voltage [V], a drive stops following commands and holds its joint
-    #: If two successive encoder samples show a higher joint speed [rad/s], a drive that holds its joint assumes an encoder jump.
+    #: If two successive encoder samples show a joint speed above this value [rad/s], a holding drive assumes an encoder jump.
     jump_speed: float = 20.0
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
-    rest_speed: float = 0.05  # a joint that sinks against its brake counts as stopped below this joint speed [rad/s]
+    rest_speed: float = 0.05  # in FAULT REACTION ACTIVE, a joint counts as stopped below this joint speed [rad/s]
 
 
 class DriveSignals(NamedTuple):
@@ -103,7 +103,8 @@ class Drives:
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
         #: latched[i] is True if drive i left OPERATION ENABLED without a command, for example to hold its joint.
         #: A latched drive ignores ENABLE_OPERATION. A controlword that changes the drive state unlatches the drive.
-        #: QUICK_STOP also unlatches the drive, but not in QUICK STOP ACTIVE or FAULT while the cause of an error persists.
+        #: QUICK_STOP also unlatches the drive, with one exception: in the states QUICK STOP ACTIVE and FAULT, QUICK_STOP has no
+        #: effect while the cause of an error persists.
         self.latched = [False] * len(JOINTS)
         #: enable_delay[i]: number of ENABLE_OPERATION commands that drive i ignores before it enters OPERATION ENABLED.
         self.enable_delay = [0] * len(JOINTS)
@@ -120,9 +121,9 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: Last controlwords of all drives that had no effect on any drive, as bytes. `_apply_controlword` describes the effects.
+        #: Last set of twelve controlwords without an effect on any drive, as bytes. `_apply_controlword` describes the effects.
         #: If the HAL sends the same controlwords again, the drives need not evaluate them.
-        #: Empty after a change of a drive state or an error, because then the same controlwords may have an effect.
+        #: Empty after a change of a drive state or of an error, because then the same controlwords may have an effect.
         self._steady = b""
         #: Joint position at which each drive holds its joint [rad]. NaN before the first encoder sample and after a state change.
         #: `_without_command` replaces NaN by the measured joint position.
@@ -219,7 +220,7 @@ class Drives:
         if jumped.any():
             self._hold_at[jumped] += speed[jumped] * PERIOD
             speed[jumped] = 0.0
-        # New hold positions are set only now, without this shift, because the measured position already contains the jump.
+        # Set new hold positions only after this shift: they are measured positions, which already contain the jump.
         begins = np.isnan(self._hold_at)
         if begins.any():
             self._hold_at[begins] = self.encoders.angle[begins]
@@ -377,7 +378,7 @@ class Drives:
             self._steady = words
 
     def _apply_controlword(self, drive: int, word: int) -> bool:
-        """Apply a controlword to a drive, and return whether it had an effect.
+        """Apply a controlword to a drive, and return whether the controlword had an effect.
 
         An effect is a new drive state, the acknowledgement of an error, or an ENABLE_OPERATION counted for `enable_delay`.
         """
@@ -424,7 +425,7 @@ class Drives:
         self.errors.advance()
 
     def _check_temperature(self) -> None:
-        """Reduce the torque limit of hot drives and switch off drives above the trip temperature."""
+        """Reduce the torque limit of hot drives, and switch off each drive that has reached the trip temperature."""
         temperature, parameters = self.motors.temperature, self.parameters
         # Round to whole degrees: the HAL gets the temperature in whole degrees, and must compute the same torque limit.
         self._own_limit[:] = self._robot.torque_limit(np.rint(temperature))

@@ -117,7 +117,7 @@ class Errors:
             self._active[node][code] = False
 
     def acknowledge(self, node: int) -> None:
-        """Remove the errors of a node whose cause no longer exists.
+        """Remove each error of a node if the cause of the error no longer exists.
 
         If the node then has no active error or warning left, report this by an emergency with code 0.
 
@@ -138,7 +138,7 @@ class Errors:
         return any(self._active[node].values())
 
     def has(self, node: int, code: int) -> bool:
-        """Return whether a node has a given error, and the cause of the error still exists.
+        """Return whether a node has an active error with the given code and with a cause that still exists.
 
         Args:
             node: index of the node.

@@ -54,7 +54,8 @@ _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 _HALF_TURN = 128
 #: The HAL sends one SYNC on each bus. After the first SYNC, the emulator waits at most this time for all other SYNCs [s].
 _SYNC_SKEW = 200e-6
-#: To catch up with real time, `run` simulates at most this number of cycles without SYNC. Then it polls the bus and `stop`.
+#: Largest number of cycles without SYNC that `run` simulates in a row to catch up with real time.
+#: After these cycles, `run` calls `stop` and receives frames.
 _CATCH_UP = 20
 
 
@@ -189,7 +190,7 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: _leg_syncs[leg]: index i of the SYNC that the drives of the leg receive.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: _answered[i]: copy of the frames `_shares[i]`, made in the last cycle that `_imperfect_cycle` ran.
+        #: _answered[i]: copy of the frames `_shares[i]`. `_imperfect_cycle` renews this copy each time it starts a cycle.
         #: If SYNC i arrives after another SYNC has started the cycle, the nodes on the bus of SYNC i send `_answered[i]`.
         self._answered = self._shares
         batch = new_frames(_BATCH)

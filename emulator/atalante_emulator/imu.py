@@ -105,7 +105,7 @@ class AttitudeError:
             self.apply(0.0, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
 
     def draw(self) -> None:
-        """Start an interval: draw the attitude errors that the IMUs have at its end.
+        """Start an interval: draw the attitude errors that the IMUs have at the end of the interval.
 
         During the interval, `apply` interpolates linearly between the errors at its start and at its end.
         """

@@ -42,7 +42,8 @@ class _Disturbance:
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # A fault of kind `inject` also receives the frames of the cycle before its start: it sends copies of the last real frame.
+        # A fault of kind `inject` sends copies of the last real frame. To have a real frame at its start, the fault receives
+        # frames from the previous cycle on.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)

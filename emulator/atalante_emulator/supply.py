@@ -1,4 +1,4 @@
-"""Supply of the drives without a battery: the capacitors of the DC link discharge into the drives."""
+"""Drive supply after a loss of the battery: the capacitors of the DC link discharge into the drives."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from atalante_hal.types import PERIOD, Vector
 
 _log = logging.getLogger(__name__)
 
-#: Largest lean of the pelvis at which the operator exerts no force [rad]. The pelvis of a walking robot leans by less.
+#: Largest lean of the pelvis at which the operator exerts no force [rad]. A walking robot leans less than that.
 DEADBAND: Final = 0.1
 STIFFNESS: Final = 2000.0  # force divided by (lean - `DEADBAND`) [N/rad]
 DAMPING: Final = 300.0  # force per lean rate [N s/rad]

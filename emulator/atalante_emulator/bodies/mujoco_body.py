@@ -32,8 +32,8 @@ class Contact(NamedTuple):
 
     #: Time constant [s] and damping ratio of the spring that pushes the shapes apart.
     solref: tuple[float, float] = (0.02, 1.0)
-    #: Hardness of the contact from 0 (soft) to 1 (rigid): at first touch, and when the shapes have sunk deep into each other.
-    #: MuJoCo calls the hardness of a contact impedance.
+    #: Hardness of the contact at first touch, and hardness after the shapes have sunk deep into each other.
+    #: Each value is between 0 (soft) and 1 (rigid). MuJoCo's name for this hardness is "impedance".
     solimp: tuple[float, float] = (0.99, 0.99)
     impratio: float = 1.0  # contact hardness against sliding, divided by contact hardness against sinking in
 

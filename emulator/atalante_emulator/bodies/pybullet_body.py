@@ -104,7 +104,7 @@ class PyBulletBody:
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
-        # Only the pads of the soles and the floor can be in contact. So contacts are read only if there is a floor.
+        # Contacts occur only between the floor and the pads of the soles, so contacts are read only if there is a floor.
         self._touches = ground is not None
         if ground is not None:
             self._add_floor(ground, friction)
@@ -158,8 +158,8 @@ class PyBulletBody:
             pybullet.changeDynamics(self._body, pad, lateralFriction=friction, **client)
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # The first 1 requests velocities. The second 1 makes PyBullet compute the link poses from the current joint positions.
-        # If the second 1 were 0, `getLinkStates` would return the link poses of the previous time step.
+        # The first argument 1 requests velocities. The second argument 1 requests link poses at the current joint positions.
+        # With 0 as the second argument, `getLinkStates` would return the link poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
