@@ -26,7 +26,7 @@ if not DESCRIPTORS.is_file():
     parser.error(f"the program must be started in the root of the project, got {Path.cwd()} without {DESCRIPTORS}")
 settings = {
     "mode": "client",
-    # -1: no timeout, retry until the HAL answers. The default waits up to 4 s between two attempts.
+    # A timeout of -1 means no timeout. Without `retry`, Zenoh would wait up to 4 s between two attempts.
     "connect": {
         "endpoints": [endpoint],
         "timeout_ms": -1,

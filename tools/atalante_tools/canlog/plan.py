@@ -52,7 +52,7 @@ class Plan:
         count = len(self.layouts)
         headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
         #: Identifier, length and flags that the frames of each message must have, as one number (`header_word`).
-        #: `headers` is 0 for a message with an unsupported layout, and in the last element, which has the index `UNKNOWN` (-1).
+        #: The element of a message with an unsupported layout is 0. The last element, with the index `UNKNOWN` (-1), is also 0.
         self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)
         self.lengths = np.array([m.length for m in self.layouts], np.int64)
         self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])

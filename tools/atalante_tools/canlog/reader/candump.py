@@ -48,7 +48,7 @@ _NAME_BYTES = 16  # maximum length of a channel name in a line of the usual form
 _MAX_BYTES = 64  # maximum length of a payload
 _STANDARD = 0x7FF
 _STAMP_END = 1 << 63  # first time that does not fit into a stamp [ns], in the year 2262
-#: Maximum time in a line of the usual format [s]. With each fraction of a second, it fits into a stamp.
+#: Maximum number of whole seconds in a line of the usual format. With any added fraction, the time fits into a stamp.
 _MAX_SECONDS = _STAMP_END // 10**9 - 1
 _NO_DIGIT = 0x1000
 #: Lookup table: ASCII code -> value of the hexadecimal digit (0 to 15), or `_NO_DIGIT` if the character is not such a digit.
@@ -139,9 +139,9 @@ def parse_usual(
         after the last line, otherwise this line has another format or an unknown channel name.
     """
     if begin < end:
-        columns.words[row] = 0  # the caller may have rejected a line of which this function had parsed the payload
+        columns.words[row] = 0  # delete the payload of a line that the previous call could not parse completely
     while begin < end:
-        if text[begin] != _OPEN:  # checked first, because an empty last line is followed by bytes of an earlier text
+        if text[begin] != _OPEN:  # check this first: the bytes after an empty last line belong to an earlier text
             break
         seconds, dot = _number(text, begin + 1, 10, 10)
         if dot == begin + 1 or text[dot] != _DOT or seconds > _MAX_SECONDS:

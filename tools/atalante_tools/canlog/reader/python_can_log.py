@@ -123,7 +123,10 @@ def _with_absolute_times(reader: Any) -> Iterator[Any]:
 
 
 def _without_last(messages: Iterator[Any]) -> Iterator[Any]:
-    """Yield all messages except the last, whose line is truncated. Before a read error, yield all messages that were read."""
+    """Yield all messages except the last, whose line is truncated.
+
+    If a read error occurs, yield all messages before the error, then raise the error.
+    """
     held: Any = None
     try:
         for message in messages:

@@ -167,7 +167,7 @@ class DriveRules:
         indices: npt.NDArray[np.intp],
         stamps: npt.NDArray[np.int64],
     ) -> None:
-        """Apply all changes of drive state and controlword in order of time; before each, check whether a response is overdue.
+        """Apply all changes of drive state and controlword in order of time. Before each change, check for an overdue response.
 
         Args:
             drive: drive that is updated with each change.

@@ -29,7 +29,7 @@ PAUSE_NS: Final = 200_000_000
 #: A restart of the HAL or a damaged SYNC frame makes the cycle number jump, so the increase is then not plausible.
 MOST_STEPS: Final = 1000
 #: The frames of a cycle get new time stamps at intervals of `_SPACING_NS` [ns]: 0 for SYNC, then 1000, 2000 and so on.
-#: No frame of a cycle gets a time stamp later than `_LAST` times the cycle time after SYNC.
+#: The time from SYNC to a frame is limited to the fraction `_LAST` of the cycle time.
 _SPACING_NS, _LAST = 1000, 0.7
 
 
