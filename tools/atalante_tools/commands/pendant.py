@@ -68,7 +68,7 @@ def start(target: Target, seconds: float | None) -> None:
 @target_options(embedded=False, clock=False)
 @for_option
 def xi(factor: float, target: Target, seconds: float | None) -> None:
-    """Set the assistance factor to X, from 0 (patient alone) to 1 (robot alone).
+    """Set the assistance factor to X, from 0 (widest guide) to 1 (full assistance).
 
     The command keeps the dead-man switch pressed and runs until Ctrl-C. At the end it presses STOP and releases the
     dead-man switch.
