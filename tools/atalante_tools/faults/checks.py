@@ -18,7 +18,7 @@ _KNEE: Final = JOINTS.index("left_SK")
 _SAG: Final = math.radians(1.0)
 #: Largest number of cycles from START to the event START_FAILED if a drive cannot be enabled.
 _FAILED: Final = 20
-#: Number of cycles without a command after which a drive must hold its position without the HAL (local hold).
+#: After this number of cycles without a command, a drive must hold its position by itself (local hold).
 #: `_WATCHDOG` is not imported from the emulated drive, so that an error in the emulator cannot change the check.
 _WATCHDOG: Final = 5
 #: Largest accepted true speed of a joint, as a multiple of its velocity limit.

@@ -20,7 +20,8 @@ from atalante_tools.faults.checks import (
 from atalante_tools.faults.scenario import Case, HostFault, OperatorAction, Scenario
 
 _S = SupervisorState
-#: Joint that hardly moves while the left leg swings, so that each jump of its encoder is rejected.
+#: Joint that hardly moves while the left leg swings. Therefore the HAL does not take a jump of its encoder for real motion, and
+#: rejects the new position.
 _STILL: Final = "RIGHT_FH"
 _KNEE: Final = "LEFT_SK"
 _HIP: Final = "LEFT_SH"
@@ -384,7 +385,7 @@ SCENARIOS: Final = (
             )
         ),
     ),
-    # Each push accelerates the joint above its top speed within the time limit of F71, which is 25 cycles.
+    # Each push accelerates the joint above its top speed within 25 cycles, the time limit of F71.
     Scenario(
         "F71",
         tuple(

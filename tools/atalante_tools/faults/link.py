@@ -103,7 +103,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # short, because the HAL reports the constant injected forces as a fault after 100 cycles
+                    observed=40,  # less than 100, because the HAL reports constant forces as a fault after 100 cycles
                     suspended=True,
                 )
                 for frames, state, dtc, reacted in (
@@ -305,7 +305,7 @@ SCENARIOS: Final = (
         permanent=Case("permanent", (Fault("flags", _STATE, flags=_ERROR_PASSIVE),)),
     ),
     # A second sender copies the last frame of a node, changes signals of the copy, and adds `ahead` to its alive counter.
-    # If `ahead` is 1, the copy has the counter of the node's next frame. If `ahead` is 0, the copy has that of the last frame.
+    # If `ahead` is 1, the copy has the counter of the node's next frame. If `ahead` is 0, it has the counter of the last frame.
     Scenario(
         "F58",
         (

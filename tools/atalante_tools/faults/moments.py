@@ -64,7 +64,8 @@ SAG_OF: Final = {
 _MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
-#: Data age [cycles] of a drive from which the HAL cannot find a motor fault of this drive. Such cycles do not count in `FOUND`.
+#: The HAL cannot find a motor fault of a drive while the data age of this drive is at least this number [cycles].
+#: Such cycles do not count in `FOUND`.
 _SILENT: Final = 5
 #: Number of cycles from READY to the operator's START.
 _PAUSE: Final = 50
@@ -248,8 +249,9 @@ def _motor_faults(stimuli: Sequence[Stimulus]) -> list[Fault]:
 
 
 def _unlimited(run: Observation, motor: Fault, starts: Sequence[int]) -> list[tuple[range, slice]]:
-    """Return the cycles in which the joint speeds of the leg with a motor fault are not checked, with the joints of this leg.
+    """Return the cycles in which the check of the joint speeds is off, and the joints of the leg with the motor fault.
 
+    Only the speeds of these joints are not checked.
     Each range contains `FOUND` cycles with data of the faulty motor. The ranges begin with the fault and with each later START.
 
     Args:

@@ -45,7 +45,7 @@ ASSISTANCE: Final = 0.5
 _START: Final = 600
 #: Number of cycles between two presses of START after the fault. The first press ends FAULT, the second press ends HOLD.
 RECOVERY: Final = 100
-#: From this number of cycles after the START that ends HOLD on, the run ends as soon as the robot is not ACTIVE.
+#: Longest wait for ACTIVE after the START that ends HOLD [cycles]. After this wait, the run ends in any other state.
 _RESTART: Final = 300
 
 

@@ -45,7 +45,7 @@ class Drive(NamedTuple):
     state: DriveState
     latched: bool  # whether the drive left OPERATION ENABLED without a command; it then ignores ENABLE OPERATION
     missed: int  # age of the last valid command [cycles]; ages above `WATCHDOG` are stored as `WATCHDOG`
-    unsynced: int  # number of consecutive cycles without SYNC; higher numbers are stored as `WATCHDOG`
+    unsynced: int  # number of consecutive cycles without SYNC; numbers above `WATCHDOG` are stored as `WATCHDOG`
     errors: tuple[int, ...]  # codes of the errors whose cause persists
 
 

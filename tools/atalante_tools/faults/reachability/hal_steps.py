@@ -334,7 +334,7 @@ class HalSteps:
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_cycles_left, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
-        monitor.recalled = -RECALL_CYCLES  # no wait after QUICK_STOP, so that more STARTs lead to ACTIVE
+        monitor.recalled = -RECALL_CYCLES  # as if QUICK_STOP was sent long ago, so that ACTIVE is not delayed
         # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search does not count:
         # in each cycle, it tries both possible results: the start ends (`LAST_START`), and the start continues (`START`).
         monitor._stalled = 0
