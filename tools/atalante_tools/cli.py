@@ -38,7 +38,7 @@ COMMANDS = {
 }
 
 
-#: Key in `click.Context.meta` of the words of the command line after `atalante`.
+#: Key in `click.Context.meta`. The value is a tuple with all words of the command line after `atalante`.
 _WORDS = "atalante_tools.words"
 
 
@@ -74,7 +74,9 @@ class Commands(click.Group):
             raise SystemExit(failure.exit_code) from error
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read the options of the group. Keep the words of the command line for `_called`, because click removes those it reads.
+        """Read the options of the group, and store the words of the command line for `_called`.
+
+        The words are stored first, because click removes words from `args`.
 
         Raises:
             Failed: If an option of the group is invalid. The message is one sentence.
@@ -88,12 +90,15 @@ class Commands(click.Group):
             raise self._invalid(error, ctx) from error
 
     def _invalid(self, error: click.UsageError, ctx: click.Context) -> InvalidUsage:
-        """Return the error of click as one sentence that ends with the command to get help."""
+        """Return the error of click as one sentence. The sentence ends with the command that prints the help."""
         command_path = error.ctx.command_path if error.ctx else self._called(ctx)
         return InvalidUsage(f"{error.format_message().rstrip('.')}; see `{command_path} --help`")
 
     def _called(self, ctx: click.Context) -> str:
-        """Return the names of the called command. click adds no context to an error such as a missing value of an option."""
+        """Return the full name of the called command, such as `atalante dbc diff`.
+
+        Some errors of click, such as a missing value of an option, do not contain the command.
+        """
         command: click.Command | None = self
         names = [ctx.command_path]
         for word in ctx.meta[_WORDS]:

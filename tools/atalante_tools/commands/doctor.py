@@ -121,7 +121,7 @@ def command(interface: str, channel: str, measure: bool, seconds: float, as_json
         _show_facts(interface, as_json)
     if missing := [check for check in checks if check.needed and not check.ok]:
         names = ", ".join(check.name for check in missing)
-        # The name of the channel alone would only repeat the beginning of the sentence.
+        # If only the check of the channel failed, give its reason. The sentence already begins with the name of the channel.
         why = missing[0].text if names == channel else names
         raise Failed(f"{interface} {channel}".rstrip() + f" is not ready: {why}")
     if measure:

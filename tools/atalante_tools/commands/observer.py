@@ -30,7 +30,7 @@ class NodeReport:
 
     node: str
     kind: str
-    #: Time [ms] since the node sent one of its messages with the shortest period; None before the first of them.
+    #: Time since the last of the most frequent frames of the node (see `Observer._fast`) [ms]. None before the first frame.
     age_ms: int | None
     late: bool  # whether `age_ms` exceeds the message timeout in the DBC
     #: Time since the last status message of the node [ms]. None before the first status message.
@@ -169,7 +169,7 @@ class Observer:
         return report
 
     def _fast(self, node: Node) -> list[Message]:
-        """Return the messages with the shortest period of all periodic messages of a node.
+        """Return the most frequent messages of a node: all periodic messages that have the shortest period.
 
         For the HAL, return only the SYNC messages. The commands have the same period, but the HAL does not always send commands.
         """

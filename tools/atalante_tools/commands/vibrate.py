@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from atalante_hal.types import State
 
 #: The measured level is checked only if the vibration lasts at least this time [s].
-#: The slowest motor that `atalante conform` accepts has a time constant of 0.06 s. In 0.1 s it reaches 80 % of its level.
+#: The slowest motor that `atalante conform` accepts has a time constant of 0.06 s.
+#: This motor reaches 80 % of the commanded level in 0.1 s.
 _CHECKED: Final = 0.1
 #: The command fails if the measured level stays below this share of the commanded level.
 _REACHED: Final = 0.5

@@ -154,9 +154,9 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 @click.option(
     "--robot-process/--no-robot-process",
     default=None,
-    help="Run the emulated robot in a process of its own, in parallel with the HAL. With idle processor cores, the walk is then "
-    "faster. The result is the same.  [default: own process if a processor core is idle; with a CAN log or a recording rate "
-    "above 100 Hz, if two cores are idle]",
+    help="Run the emulated robot in a process of its own, in parallel with the HAL. With idle processor cores, the walk is "
+    "then faster. The result is the same.  [default: own process if enough processor cores are idle: one core, or two cores "
+    "with a CAN log or a recording rate above 100 Hz]",
 )
 @options_as("recording", RecordingOptions, RECORDING_OPTIONS)
 @target_options(embedded=True)

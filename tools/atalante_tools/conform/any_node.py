@@ -37,7 +37,7 @@ _LISTED: Final = 3
 
 
 def requirements_at_rest(tester: NodeTester) -> list[Requirement]:
-    """Return the requirements for every node that are tested while the node is at rest."""
+    """Return those requirements for all nodes that are tested while the node is at rest."""
     state = tester.state_message
     requirements = [
         Requirement(
@@ -118,7 +118,7 @@ def requirements_at_rest(tester: NodeTester) -> list[Requirement]:
 
 
 def requirements_on_all_frames(tester: NodeTester) -> list[Requirement]:
-    """Return the requirements for every node that are tested on all frames received in the examination."""
+    """Return those requirements for all nodes that are tested on all frames received in the examination."""
     all_frames = "all frames received in this examination"
     return [
         Requirement(
@@ -245,7 +245,7 @@ def is_silent_without_sync(tester: NodeTester) -> Outcome:
     text = f"{len(received)} state frames in 10 ms without SYNC"
     answers = tester.states(tester.idle(2))
     if not (received or answers):
-        raise NotTested(f"{text}, and no answer of the DBC length to SYNC; see NODE-04 and NODE-13")
+        raise NotTested(f"{text}, and no state frame of the DBC length after SYNC; see NODE-04 and NODE-13")
     return Outcome(not received, text)
 
 

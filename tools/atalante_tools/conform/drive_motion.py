@@ -35,7 +35,8 @@ def reports_consistent_motion(tester: NodeTester) -> Outcome:
     steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(cycles) * PERIOD
     integral = np.concatenate([[0.0], np.cumsum(steps)])
     signal = tester.state_message.signal("Velocity")
-    # A drive sends a velocity outside the DBC range as the end of the range.
+    # If the velocity is outside the DBC range, a drive sends the nearest limit of the range.
+    # Windows that contain such a value are left out.
     clipped = (velocity <= signal.minimum) | (velocity >= signal.maximum)
     count = np.cumsum(clipped)
     complete = cycles[WINDOW:] - cycles[:-WINDOW] == WINDOW  # windows without a lost frame

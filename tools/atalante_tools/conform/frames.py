@@ -87,7 +87,7 @@ class MessageSender:
 
     @property
     def counter(self) -> int:
-        """Return the alive counter of the last frame whose counter the caller did not choose."""
+        """Return the last alive counter that `frame` computed. Counters that the caller gave to `frame` are left out."""
         return self._counter
 
 

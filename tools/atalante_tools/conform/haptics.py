@@ -130,7 +130,8 @@ def follows_like_a_lag(tester: NodeTester) -> Outcome:
         if len(rising) < 3:
             return Outcome(False, "a motor does not follow its level")
         squares = rising[:-1] @ rising[:-1]
-        # Fit the factor by least squares. The factor is 0 for a motor that is at its level in the next state frame.
+        # Fit by least squares the factor by which the distance from the level shrinks between two state frames.
+        # The factor is 0 if the motor reaches the level within one state frame.
         factor = float(rising[1:] @ rising[:-1] / squares) if squares else 0.0
         model = rising[0] * factor ** np.arange(len(rising))
         if factor:

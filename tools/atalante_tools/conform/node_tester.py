@@ -235,7 +235,7 @@ class NodeTester:
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        # Use the same array again for the same number of frames, because a bus stores each new array object in its cache.
+        # Keep one array for each number of frames and fill it again, because a bus caches memory views of each array object.
         outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:

@@ -72,7 +72,8 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_tools.canlog.validate.project", "ProjectError", InvalidUsage),
 )
 
-#: Largest number of lines after the first line of a message. A longer message is cut to its first line and "and N more".
+#: Largest number of lines after the first line of a message. If a message has more lines, only its first line is shown,
+#: followed by the number of the other lines, such as ", and 5 more".
 MOST: Final = 2
 #: Error numbers of a failed write: disk full, over quota, read-only, I/O error.
 DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})

@@ -168,7 +168,10 @@ static const struct {{
 
 
 def _counter_check(name: str) -> str:
-    """Return the C function that checks each counter that follows counter 0."""
+    """Return the C function that checks a frame with counter 0, and then a frame with counter k, for each k from 0 to 255.
+
+    The function compares each result of the E2E check with the result of the Python check.
+    """
     counters = ", ".join(str(int(check_counter(0, counter))) for counter in range(256))
     return f"""\
 /* Result of the Python check for each counter that follows counter 0. */

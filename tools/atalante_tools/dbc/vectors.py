@@ -67,7 +67,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _half_steps(self) -> Vector:
-        """Return for each signal the physical value half a quantisation step above an even raw code, shape (signals,).
+        """Return one physical value per signal, shape (signals,): half a quantisation step above an even raw code.
 
         The value is the minimum of the signal if its range has no such code or if float64 arithmetic is not exact.
         """

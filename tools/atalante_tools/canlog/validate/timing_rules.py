@@ -199,7 +199,7 @@ class TimingRules:
         steps: Steps,
         rejected_before: Steps | None,
     ) -> None:
-        """Add the intervals in a chunk to the interval histograms, and update the numbers and sums of the intervals.
+        """Add the intervals in a chunk to the interval histograms, and update the number and the sum of the counted intervals.
 
         Timeouts and intervals with lost, repeated or rejected frames are not added.
         """

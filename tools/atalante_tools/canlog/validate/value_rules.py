@@ -232,10 +232,9 @@ class _FamilyChecks:
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
         #: Field index -> raw code that means "no value". `_check_limits` searches the frames for each of these codes.
-        #: `coded` omits a field if its code for "no value" is outside the limits of the field in `bounds`.
-        #: Reason: `_check_limits` finds this code without `coded`, because it searches for all codes outside the limits.
-        #: `coded` also omits all fields in `special`.
-        #: Reason: `_check_special` compares each raw code of such a field with the field's code for "no value".
+        #: Two kinds of fields are left out, because their code for "no value" is found without `coded`:
+        #: - Fields whose code is outside their limits in `bounds`. `_check_limits` finds every code outside the limits.
+        #: - Fields in `special`. `_check_special` compares each raw code with the code for "no value".
         self.coded = {
             p: code
             for p, f in fields
