@@ -66,7 +66,9 @@ def announce(certificates: Collection[Certificate], mismatch: Mismatch, leg: str
 
 
 def report_hand_overs(name: str, statistics: GuideStatistics) -> None:
-    """Print in how many steps the certificate did not apply, and how many had no guide. Print nothing if there is no such step.
+    """Print how many steps the certificate does not cover, and how many steps were at least partly without a guide.
+
+    A number that is zero is not printed.
 
     Args:
         name: Name of the guide shape.

@@ -56,7 +56,7 @@ def gait_in_the_air(files: GaitFiles, subject: Subject | None, robot: Robot) -> 
 
 
 def patient_of_files(files: GaitFiles, patient: Patient | None, robot: Robot) -> Patient | None:
-    """Return the patient for an emulated robot: the patient of the user, or else the patient in the gait file.
+    """Return the patient of an emulated robot: the patient that the user gave, otherwise the patient in the gait file.
 
     The robot gets the leg lengths of this patient. The result is None if neither the user nor the file states a patient.
 

@@ -110,7 +110,7 @@ class Rig:
                 self.hal.end()
 
         def over(state: State) -> bool:
-            # The end condition of a controller may never become true in HOLD, for example a number of steps.
+            # In HOLD, the end condition `until` may never become true, for example if it waits for a number of steps.
             return until(state) or (held and not self.hal.moving)
 
         with ended_by(end) as stop:

@@ -44,7 +44,7 @@ class WalkWatch:
         self._rig, self._controller, self._observation, self._stop = rig, controller, observation, stop
         self._steps, self._progress, self._started = steps, Progress(), False
         self.outcome, self._reason, self._halted = "hold", "", 0
-        self._signals = 0  # number of stop signals received by the end of the motion
+        self._signals = 0  # number of stop signals that arrived before the motion ended
         self.full_assist = False
 
     def __call__(self, state: State) -> bool:

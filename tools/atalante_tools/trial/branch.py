@@ -76,7 +76,7 @@ class Continuation:
         Args:
             answer: object that can be pickled.
         """
-        self._answered = True  # from now on, the next request makes the pipe readable
+        self._answered = True  # after the answer, the pipe also becomes readable when the next request arrives
         self._channel.send(answer)
         os._exit(0)
 

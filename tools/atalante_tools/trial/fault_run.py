@@ -54,8 +54,8 @@ _LONGEST: Final = 20_000
 #: The robot is at rest if two conditions are true for `_RESTED` cycles:
 #: pelvis and joints are slower than `_STILL` [m/s, rad/s], and each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
-#: A walk has the outcome "walked" after `_LANDINGS` landings since the end of the fault and `_WALKED` more cycles of walking.
-#: A walk that the robot completes has the outcome "walked", too.
+#: A walk has the outcome "walked" if the robot completes it.
+#: It also has this outcome if two events follow the end of the fault: `_LANDINGS` landings, then `_WALKED` cycles of walking.
 _WALKED: Final = 400
 _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.

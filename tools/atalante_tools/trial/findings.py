@@ -26,7 +26,7 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 #: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
-#: `TREND`: If a value must fall with a rising assistance factor, the rank correlation of the two must be at most -`TREND`.
+#: `TREND`: Some values must fall as the assistance factor rises. Their rank correlation with the factor must be <= -`TREND`.
 #: `ASYMMETRY`: On each day of the sweep, the factor falls from 1 to 0 and then rises to 1, so each factor above 0 has two walks.
 #: The mean absolute difference between two walks with the same factor must be at most `ASYMMETRY` times the range of all values.
 TREND, ASYMMETRY = 0.8, 0.25
@@ -44,7 +44,7 @@ CERTIFIED, ROBUST = 0.95, 0.98
 SIDEWAYS, SIDEWAYS_WITH_REFERENCE = 1.5, 0.5
 #: The root mean square error of the estimated vertical must be below this angle in every walk [deg].
 ATTITUDE: Final = 0.5
-#: Forces of a push of 0.2 s that the robot must withstand at every phase of a step [N].
+#: Push forces [N] that the robot must withstand at every phase of a step. A push lasts 0.2 s.
 #: `PUSH_WORST` applies to every direction, `PUSH_FORWARD` to a push forwards.
 PUSH_WORST, PUSH_FORWARD = 200.0, 300.0
 
@@ -274,7 +274,7 @@ def normalised(result: Result) -> float:
 
 
 def step_variation(result: Result) -> float:
-    """Return the variation of the joint angle errors between the last steps of a walk, as a fraction of the guide half-width.
+    """Return how much the joint angle errors vary over the last steps of a walk, as a fraction of the guide half-width.
 
     The ratio e / q_bound is the angle error of a joint divided by the half-width of the guide. Its standard deviation over the
     steps is computed at each phase and for each joint. The result is the mean of these standard deviations.
@@ -383,7 +383,7 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Test that a value at a given assistance factor hardly depends on whether the factor falls or rises; return the finding.
+    """Compare a value in pairs of walks with equal assistance factor, and return the finding.
 
     On each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. Each factor above 0 therefore has two
     values. Days with a missing trial are left out.

@@ -90,7 +90,7 @@ class ShapeTrial:
         return f"shape-{self.shape}"
 
 
-#: Kinds of subjects. The field `active` of a trial is the index: False is 0, True is 1.
+#: Kinds of subjects. `KINDS[trial.active]` is the kind of the subject of a trial.
 KINDS: Final = "passive", "active"
 
 
@@ -137,7 +137,7 @@ class RobustTrial:
     friction: float  # coefficient of friction between soles and floor
     delay: tuple[int, int, int]  # cycles by which state messages, command messages and motor torques are late
     loss: float  # probability that a frame is lost, on all buses
-    #: time [s] and direction [deg] of each push; time 0 is the end of the start step, with which the robot begins to walk
+    #: time [s] and direction [deg] of each push; the time counts from the start of the first periodic step
     pushes: tuple[tuple[float, float], ...]
     force: float  # force of each push [N]
     steps: int
@@ -442,7 +442,7 @@ def source_hash(roots: Sequence[Path], ignored: Sequence[Path] = ()) -> str:
 
 
 def _content(file: Path) -> bytes:
-    """Return the part of a file that can change a result: all bytes, or the syntax tree of a Python file without docstrings."""
+    """Return the part of a file that can change a result: all bytes; for a Python file, the syntax tree without docstrings."""
     if file.suffix != ".py":
         return file.read_bytes()
     tree = ast.parse(file.read_bytes())
