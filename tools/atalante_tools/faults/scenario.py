@@ -59,7 +59,9 @@ Stimulus = Fault | HostFault | OperatorAction
 
 
 def invalid_code(message: str, signal: str) -> int:
-    """Return the unsigned raw code in the DBC with which a node reports that a signal has no value.
+    """Return the unsigned raw code that a node sends when a signal has no value.
+
+    The DBC defines this code.
 
     Args:
         message: name of the message.

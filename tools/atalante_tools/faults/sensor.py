@@ -150,7 +150,7 @@ SCENARIOS: Final = (
             ),
             *(
                 Case(f"{1e3 * by:g} mrad for 100 cycles", (Fault("encoder_jump", _STILL, 0, 100, by=by),), node=_STILL)
-                # 22.5 mrad is the largest joint motion that the HAL accepts within five cycles, and each jump is larger.
+                # The HAL accepts a joint motion of at most 22.5 mrad within five cycles. Each of these jumps is larger.
                 for by in (0.025, -0.025, 0.1, -1.0)
             ),
             # The drives begin to hold their position in the cycle in which the encoder jumps back.

@@ -1,4 +1,4 @@
-"""Evaluation of a run with a fault by four checks. A check that fails adds a sentence to the verdict.
+"""Evaluation of a run with a fault. Each failed check adds a sentence to the verdict.
 
     observation + row of the fault matrix -> verdict
 

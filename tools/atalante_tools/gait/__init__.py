@@ -54,9 +54,9 @@ def levels_of(text: str) -> tuple[float, ...]:
 
 
 def lengths_of(text: str) -> tuple[float, ...]:
-    """Convert the text of a grid option to lengths [m], for example "0.15,20" (0.15 m and 20 cm) to (0.15, 0.2).
+    """Convert the text of a grid option to lengths [m].
 
-    A number below 5 is in metres, any other number is in centimetres.
+    A number below 5 is in metres, any other number is in centimetres. For example, the text "0.15,20" gives (0.15, 0.2).
 
     Raises:
         click.BadParameter: If the text is not a list of lengths.

@@ -111,8 +111,8 @@ _CHECK_OPTIONS = [
                  help="Run a short search: with fewer steps, without pushes above the limits of --push, and without steps on the "
                       "emulated robot (unless --robot-steps is given)."),
     click.option("--plot", type=OutputFile(".png", ".svg", ".pdf"), metavar="FILE",
-                 help="Draw the last guide with its bounds, the worst step, and the tracking errors from which the controller "
-                      "can still keep the joints inside the guide (safe backward image)."),
+                 help="Draw the last guide: its bounds, its worst step, and its safe area (safe backward image). From a "
+                      "tracking error in the safe area, the controller can still keep the joints inside the guide."),
     click.option("--table", type=OutputFile(".md"), metavar="FILE", help="Write the results as a Markdown table."),
     click.option("--results", type=OutputFile(".jsonl"), metavar="FILE",
                  help="Append each result to this file. Guides that the file already contains are not checked again, so the same "

@@ -61,7 +61,7 @@ class Push(NamedTuple):
     """
 
     signs: Vector  # planned direction, positive or negative, in each cycle (row) at hip and knee (columns); shape (cycles + 1, 2)
-    #: weights of the four `features` (columns) in the sums that give the directions at hip and knee (rows); shape (2, FEATURES)
+    #: weights of the `features`: one row for each joint (hip, knee), one column for each feature; shape (2, FEATURES)
     feedback: Vector
 
 
@@ -70,8 +70,8 @@ class Start(NamedTuple):
 
     deviation: Pair  # angle minus nominal angle, of hip and knee [rad]
     rate: Pair  # speed minus nominal speed, of hip and knee [rad/s]
-    #: torque jump at the stance change, of hip and knee [Nm]:
-    #: motor torque before the stance change minus torque for the nominal acceleration after the stance change
+    #: Torque jump at the stance change, of hip and knee [Nm].
+    #: It is the motor torque before the stance change, minus the torque that gives the nominal acceleration afterwards.
     carried: Pair
     ahead: Pair  # real speed minus measured speed, of hip and knee [rad/s]; a filter delays the measured speed
 

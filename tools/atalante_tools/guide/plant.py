@@ -73,7 +73,7 @@ class Plant(NamedTuple):
     coulomb: Vector  # dry friction [Nm], shape (2,)
     viscous: Vector  # viscous friction [Nm s/rad], shape (2,)
     friction_speed: float  # speed at which dry friction reaches 76 % of its full value [rad/s]
-    tracking: float  # share of the difference between command and motor torque that disappears in one cycle, 0 to 1
+    tracking: float  # in each cycle, the motor torque moves this fraction of the way to the command, 0 to 1
     keep: float  # weight of the old value in the velocity filter, 0 to 1
     torque_max: Vector  # torque limit of the limiter [Nm], shape (2,)
     torque_step: Vector  # largest change of the command in a cycle [Nm], shape (2,)

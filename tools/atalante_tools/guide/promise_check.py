@@ -56,8 +56,7 @@ PATIENTS: Final = (
 _CORNERS: Final = 64
 #: Lag of the measured velocity of a drive [s], caused by the low-pass filter and by the sampling (half a cycle).
 _VELOCITY_LAG: Final = 2.0e-3
-#: The search for the smallest push that moves a joint out of the guide multiplies the push limits by increasing factors.
-#: No factor is larger than `LARGEST_FACTOR`.
+#: Largest factor on the push limits in the search for the smallest push that moves a joint out of the guide.
 LARGEST_FACTOR: Final = 6.0
 #: For each factor, the search simulates `_SHARE` times `Effort.steps` steps, but at least ten.
 #: If `Effort.steps` is 1500, each factor gets 150 steps.

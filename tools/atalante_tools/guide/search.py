@@ -98,7 +98,7 @@ class Adversary:
         return self.tried[0]
 
     def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
-        """Search for the smallest factor on the push limits `box` with which a push moves a joint out of the guide.
+        """Search for the smallest factor for which a push up to the limits `factor * box` moves a joint out of the guide.
 
         Example: the factor is 1.5 if a push up to the limits `1.5 * box` moves a joint out of the guide. The factor grows until
         the search finds such a push. A bisection then makes the factor accurate to 5 %. Return None if the search finds no such
@@ -300,8 +300,8 @@ class Adversary:
         elif feedback.any() and change < 0.7:
             feedback += 0.3 * generator.standard_normal(feedback.shape)
         else:
-            # If the motion set the signs of the push (`Push.feedback`), use the signs in the cycles of the parent step instead.
-            # The signs are then planned values (`Push.signs`), so that the signs of some cycles can be changed.
+            # Only planned signs (`Push.signs`) can be changed below. If the push has feedback, its signs depend on the motion.
+            # In this case, first replace `signs` with the signs of the push in the parent step, and remove the feedback.
             if feedback.any():
                 signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
             begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))
