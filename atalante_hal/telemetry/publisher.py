@@ -150,7 +150,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
                 "tx": {
                     "queue": {
                         # Number of message batches in the queue. The default is 2.
-                        # With 2 batches, publishing took ten times as long as with 16.
+                        # With 2 batches, publishing took ten times as long.
                         "size": {"real_time": 16},
                         # Time after which a subscriber that reads nothing is disconnected [us]. The default is 5 s.
                         "congestion_control": {"block": {"wait_before_close": 100_000}},
