@@ -10,6 +10,7 @@ from __future__ import annotations
 import operator
 import time
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
@@ -102,7 +103,7 @@ class Hal:
         )
         self._limiter = Limiter(robot, PERIOD)
         self._torque_sent = self._limiter.last.copy()
-        self.state.torque_sent = read_only(self._torque_sent)
+        self._state.torque_sent = read_only(self._torque_sent)
         self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
         self._errors = 0  # number of consecutive cycles in which the controller raised an exception
         self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
@@ -110,13 +111,16 @@ class Hal:
             network,
             robot,
             self._image,
-            self.state,
+            self._state,
             self._parts,
             self._plausibility,
             self._limiter,
         )
         if legs is not None:
             self._safety_monitor.follow_motion(legs)
+        #: State of the last cycle, for the controller. The HAL itself uses `_state`. So a controller that assigns another array or
+        #: another number to a field by mistake changes no check.
+        self.state = copy(self._state)
         #: Log of events, such as new diagnostics and changes of the supervisor state.
         #: Repeats of a diagnostic within a second are logged as one event with a count.
         self.events = self._safety_monitor.memory.events
@@ -138,7 +142,7 @@ class Hal:
         self._image = ReceiveImage(fast, parts.signals, independent=_INDEPENDENT)
         self._slow_ids = [m.frame_id for m in received if m.cycle_ms != 1]
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
-        self.state = parts.state(assistance_factor, len(fast))
+        self._state = parts.state(assistance_factor, len(fast))
         per_turn = self.robot.polarity / self.robot.gear
         # On the bus, positions and velocities are motor-side values. Torques are joint-side values, so their factor is 1.
         self._to_joint = np.concatenate([per_turn, per_turn, np.ones(len(JOINTS))])
@@ -163,9 +167,13 @@ class Hal:
         Returns:
             State of this cycle: the same object every cycle, valid until the next `read`.
         """
-        state, image, transceiver = self.state, self._image, self._transceiver
+        state, image, transceiver = self._state, self._image, self._transceiver
         state.cycle = cycle = state.cycle + 1
         state.time = cycle * PERIOD
+        self.state.cycle, self.state.time = (
+            cycle,
+            state.time,
+        )  # already here, because a CAN log reads the cycle of each frame
         late = 0 if image.all_fresh else transceiver.receive()  # number of late answers to the previous SYNC
         self._commands.synchronise(cycle)
         count = transceiver.receive(late, image, self.patience)
@@ -187,7 +195,15 @@ class Hal:
         header[CYCLE], header[TIME] = cycle, state.time
         header[FRAMES] += count
         header[DROPPED] = transceiver.bus.dropped
-        return state
+        return self._published()
+
+    def _published(self) -> State:
+        """Copy the results of the safety monitor to the state for the controller, and return this state."""
+        state, published = self._state, self.state
+        published.supervisor, published.assistance_factor = state.supervisor, state.assistance_factor
+        published.joints_valid, published.implausible_imus = state.joints_valid, state.implausible_imus
+        published.delay = state.delay
+        return published
 
     def _skip_old_answers(self) -> None:
         """After a gap between cycles, drop the queued answers to earlier SYNCs, and process the other queued frames.
@@ -240,7 +256,7 @@ class Hal:
         limited = self._limiter.apply(command.torque, self._parts.motion)
         if not limited.finite:
             safety_monitor.report(Dtc.CMD_NONFINITE, "the commanded torque must be finite, got NaN or infinity")
-            return self._commands.send_prepared_hold(self.state.cycle)
+            return self._commands.send_prepared_hold(self._state.cycle)
         if limited.clamped:
             cycles = self._limiter.saturated
             safety_monitor.report(
@@ -271,7 +287,7 @@ class Hal:
         """
         self._commands.hold()
         self._errors = 0
-        state, control, safety_monitor = self.state, self._commands.control, self._safety_monitor
+        state, control, safety_monitor = self._state, self._commands.control, self._safety_monitor
         if safety_monitor.lowered:
             control[[node in safety_monitor.lowered for node in JOINT_NODES]] = Controlword.DISABLE_VOLTAGE
         if safety_monitor.start_cycles_left and (
@@ -306,8 +322,8 @@ class Hal:
         while a drive is off, the reported torques are the start value of the rate limit, and only the torque limit applies to
         them. In all other calls, all limits of the limiter apply.
         """
-        on = powered(self.state.drive_state)
-        torque = np.where(on, self.state.torque, 0.0)
+        on = powered(self._state.drive_state)
+        torque = np.where(on, self._state.torque, 0.0)
         if on.all() and self._safety_monitor.enabling:
             self._limiter.apply(torque, self._parts.motion)
         else:
@@ -319,7 +335,7 @@ class Hal:
     def _test_directions(self) -> None:
         """Limit and send the torques with which the HAL tests the direction of each joint."""
         proof = self._safety_monitor.proof
-        self._limiter.apply(proof.torque(self.state.position, self.state.velocity), self._parts.motion)
+        self._limiter.apply(proof.torque(self._state.position, self._state.velocity), self._parts.motion)
         proof.sent(self._limiter.last)
         self._commands.torque[:] = self._limiter.last
 
@@ -344,7 +360,7 @@ class Hal:
             self._limiter.apply(self._torque_sent, self._parts.motion)
             self._commands.torque[:] = self._limiter.last
             return self._send_command()
-        return self._commands.send_prepared_hold(self.state.cycle)
+        return self._commands.send_prepared_hold(self._state.cycle)
 
     def report(self, dtc: Dtc, text: str, *, confirmed: bool = True, value: float = 0.0) -> None:
         """Report a timing fault that the loop found at the start of a cycle. The following `read` evaluates the fault.
@@ -355,7 +371,7 @@ class Hal:
             confirmed: True if the fault is confirmed, False if it is only pending.
             value: Measured value, for the event.
         """
-        self._safety_monitor.report(dtc, text, confirmed, value, cycle=self.state.cycle + 1)
+        self._safety_monitor.report(dtc, text, confirmed, value, cycle=self._state.cycle + 1)
         if dtc is Dtc.CYCLE_GAP and confirmed:
             self._skip_old_answers()
 
@@ -382,7 +398,12 @@ class Hal:
             self.read()
             self.hold()
         self.patience = patience
-        self._safety_monitor.memory.log_repeats(self.state.cycle, final=True)
+        self._safety_monitor.memory.log_repeats(self._state.cycle, final=True)
+
+    @property
+    def ending(self) -> bool:
+        """Return whether `end` was called, so that the robot stays in HOLD."""
+        return self._safety_monitor.ending
 
     @property
     def moving(self) -> bool:
@@ -436,7 +457,7 @@ class Hal:
         return [node.name for node in self.network.nodes if node.name in names]
 
     def _send_command(self) -> Vector:
-        state, safety_monitor = self.state, self._safety_monitor
+        state, safety_monitor = self._state, self._safety_monitor
         sent = self._commands.send(state.cycle)
         if state.cycle % self._status.cycles == 0:
             worst, overruns = number_of(safety_monitor.memory.bits), self._header[OVERRUNS]

@@ -266,6 +266,11 @@ class SafetyMonitor:
         self._reports.append(finding)
         self._steady = False
 
+    @property
+    def ending(self) -> bool:
+        """Return whether `end` was called."""
+        return self._ending
+
     def end(self) -> None:
         """Request HOLD, starting with the next cycle, because the program is ending."""
         self._ending, self._steady = True, False

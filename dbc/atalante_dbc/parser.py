@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -121,18 +122,20 @@ def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
 
 
 def _sender_problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Yield each message that is not on the bus of its sender's first message. Only the master may send on several buses."""
+    """Yield each message that is not on the bus of most messages of its node. Only the master may send on several buses."""
     masters = {node.name for node in database.nodes if _attribute(node, "NodeKind") == "master"}
-    first: dict[str, RawMessage] = {}
+    sent: dict[str, list[RawMessage]] = {}
     for message in database.messages:
         for sender in set(message.senders) - masters:
-            other = first.setdefault(sender, message)
-            bus, expected = _attribute(message, "Bus"), _attribute(other, "Bus")
-            if bus != expected:
+            sent.setdefault(sender, []).append(message)
+    for sender, messages in sent.items():
+        buses = Counter(str(_attribute(message, "Bus")) for message in messages)
+        expected = buses.most_common(1)[0][0]
+        for message in messages:
+            if (bus := _attribute(message, "Bus")) != expected:
                 yield (
                     lines.message(message),
-                    f"{message.name} must be on the same bus as {other.name} ({expected}), because {sender} sends both, "
-                    f'got {bus}: set BA_ "Bus" BO_ {message.frame_id}',
+                    f"{message.name} must be on {expected}, as most messages of {sender}, got {bus}",
                 )
 
 

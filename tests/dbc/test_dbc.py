@@ -12,7 +12,7 @@ TEXT = DBC_FILE.read_text()
 
 
 #: Messages changed by the mutations: the first two joint states and the first emergency.
-MESSAGES = ("BO_ 385 ", "BO_ 386 ", "BO_ 129 ", "BO_ 401 ")
+MESSAGES = ("BO_ 385 ", "BO_ 386 ", "BO_ 129 ", "BO_ 145 ", "BO_ 401 ")
 
 
 def test_network_has_every_node_of_the_robot():
@@ -103,8 +103,8 @@ MUTATIONS = {
     "illegal length": ("BO_ 385 LEFT_FH_STATE: 12", "BO_ 385 LEFT_FH_STATE: 13", "13 bytes"),
     "unknown sender": ("BO_ 385 LEFT_FH_STATE: 12 LEFT_FH", "BO_ 385 LEFT_FH_STATE: 12 UNKNOWN", "sender"),
     "classic frame": ('BA_ "VFrameFormat" BO_ 385 14;', 'BA_ "VFrameFormat" BO_ 385 0;', "CAN FD frame"),
-    "no bus": (
-        'BA_ "Bus" BO_ 401 2;', "", r"FOOT_LEFT_STATE must be on the same bus as FOOT_LEFT_EMCY \(left_sense\), .* got left_leg"),
+    "no bus": ('BA_ "Bus" BO_ 401 2;', "", "FOOT_LEFT_STATE must be on left_sense, as most messages of FOOT_LEFT, got left_leg"),
+    "no bus of the first message": ('BA_ "Bus" BO_ 145 2;', "", "FOOT_LEFT_EMCY must be on left_sense, .* got left_leg"),
     "no cycle": ('BA_ "GenMsgCycleTime" BO_ 385 1;', "", "GenMsgCycleTime"),
     "no timeout": ('BA_ "TimeoutTime" BO_ 385 5;', "", "TimeoutTime"),
     "no data id": ('BA_ "E2EDataId" BO_ 385 41345;', "", "must have an E2EDataId"),

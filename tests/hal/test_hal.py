@@ -6,6 +6,8 @@ import contextlib
 import dataclasses
 import itertools
 import re
+from copy import deepcopy
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -247,6 +249,49 @@ def test_controller_that_resets_the_ages_does_not_delay_a_timeout(rig):
 
     run(rig.hal, Careless(), LockStep(), until=lambda state: state.supervisor is S.HOLD or state.cycle > 1000)
     assert rig.hal.reason == "LEFT_SK: a node timed out; its data is 5 cycles old"
+
+
+@pytest.mark.parametrize("field", [field.name for field in fields(State)])
+def test_controller_that_assigns_to_a_field_of_the_state_does_not_change_a_check(rig, field: str):
+    """The field keeps its value of the first cycle, as after `state.age = state.age + 0` in that cycle."""
+
+    class Careless:
+        telemetry, telemetry_fields = np.zeros(0), ()
+
+        def reset(self, state: State) -> None:
+            rig.bus.to_hal = rig.drop(0x184)
+            self.torque, self.first = state.torque.copy(), deepcopy(getattr(state, field))
+            self.calls = 0
+
+        def update(self, state: State) -> Command:
+            self.calls += 1
+            setattr(state, field, self.first)
+            return Command(self.torque, np.zeros(8))
+
+    controller, cycles = Careless(), itertools.count()
+    run(rig.hal, controller, LockStep(), until=lambda _: "NODE_TIMEOUT" in rig.codes() or next(cycles) > 1000)
+    assert rig.hal.reason == "LEFT_SK: a node timed out; its data is 5 cycles old"
+    assert controller.calls == 5
+    first = rig.hal.state.cycle
+    rig.hal.read()
+    assert rig.hal.state.cycle == first + 1
+
+
+def test_hot_drive_is_noticed_if_the_controller_replaces_its_temperature(rig):
+    class Careless:
+        telemetry, telemetry_fields = np.zeros(0), ()
+
+        def reset(self, state: State) -> None:
+            self.torque = state.torque.copy()
+
+        def update(self, state: State) -> Command:
+            state.temperature = state.temperature - 0.5
+            rig.emulator.drives.motors.temperature[KNEE] = 115.0
+            return Command(self.torque, np.zeros(8))
+
+    cycles = itertools.count()
+    run(rig.hal, Careless(), LockStep(), until=lambda _: "DERATED" in rig.codes() or next(cycles) > 1000)
+    assert next(cycles) < 1000
 
 
 def test_write_into_the_state_leads_to_hold_with_a_reason(rig):

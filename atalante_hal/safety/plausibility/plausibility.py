@@ -163,7 +163,7 @@ class Plausibility:
             self._check_rows()
             if (self._image.age[self._trunk_rows] <= _LATE).all():
                 self._trunk.follow()
-            # A saturated accelerometer measures only a part of an impact, and the knee checks integrate its readings.
+            # The values of a saturated IMU are rejected, so a part of an impact is missing in the sums of the knee checks.
             clipped = not self._imus.saturated.keys().isdisjoint(KNEE_IMUS)
             if not clipped and (self._image.age[self._knee_rows] <= _HELD).all():
                 self._knees.follow()

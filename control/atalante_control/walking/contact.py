@@ -37,14 +37,14 @@ class ImpactConfig:
 
     impact_force: float = 80.0  # N, smallest vertical force on the swing foot at an impact
     #: N, the swing foot has left the ground when its vertical force is below `release_force`.
-    #: Until then, only an impact with at least `certain_force` is accepted.
+    #: Until then, only an impact with at least `certain_rise` is accepted.
     release_force: float = 30.0
     debounce: int = 5  # an impact is detected after this number of consecutive cycles with at least `impact_force`
     earliest: float = 0.5  # impacts are ignored before this fraction of the step duration
-    #: N, smallest vertical force at an impact if the force of the swing foot was never below `release_force` in this step.
-    #: Such a foot may still be in the air: its cells report a load, for example because a strap pulls.
-    #: Without `certain_force`, the landing of such a foot would not be detected.
-    certain_force: float = 300.0
+    #: N, smallest rise of the vertical force at an impact, above its smallest value in this step. It applies if this value is not
+    #: below `release_force`. Such a foot may still be in the air: its cells report a load, for example because a strap pulls.
+    #: Without `certain_rise`, the landing of such a foot would not be detected.
+    certain_rise: float = 220.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.release_force < self.impact_force < math.inf:
@@ -52,9 +52,9 @@ class ImpactConfig:
                 f"release_force must be at least 0 N and below impact_force ({self.impact_force!r} N), "
                 f"got {self.release_force!r}"
             )
-        if not self.certain_force >= self.impact_force:
+        if not self.certain_rise >= self.impact_force:
             raise ValueError(
-                f"certain_force must be at least impact_force ({self.impact_force!r} N), got {self.certain_force!r}"
+                f"certain_rise must be at least impact_force ({self.impact_force!r} N), got {self.certain_rise!r}"
             )
         if self.debounce < 1:
             raise ValueError(f"debounce must be at least 1 cycle, got {self.debounce!r}")
@@ -72,9 +72,9 @@ class ImpactDetector:
     def start_step(self) -> None:
         """Reset the detector at the start of a step.
 
-        Until the new swing foot has left the ground, only impacts with at least `certain_force` are accepted.
+        Until the new swing foot has left the ground, only impacts with at least `certain_rise` are accepted.
         """
-        self._released, self._count = False, 0
+        self._lowest, self._count = math.inf, 0
 
     def update(self, vertical_force: float, phase: float) -> bool:
         """Return whether the step ends in this cycle. A force of NaN is neither a contact nor a release.
@@ -84,9 +84,9 @@ class ImpactDetector:
             phase: time since the stance change divided by the step duration, t / T.
         """
         config = self._config
-        if vertical_force < config.release_force:
-            self._released = True
-        least = config.impact_force if self._released else config.certain_force
+        self._lowest = min(self._lowest, vertical_force)
+        released = self._lowest < config.release_force
+        least = config.impact_force if released else self._lowest + config.certain_rise
         if phase >= config.earliest and vertical_force >= least:
             self._count += 1
         else:

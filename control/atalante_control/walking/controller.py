@@ -413,7 +413,7 @@ class WalkController:
 
         Raises:
             TypeError: If an array is not a contiguous array of float64. The kernels do not check the type. The arrays may be
-                read-only, because the kernels do not write into them.
+                read-only: the kernels write only into `gyro`, and only while `gyro` is the array of `_without_trunk`.
         """
         sent = self._sent if state.torque_sent is None else state.torque_sent
         tibiae = state.imu_gyro[_TIBIAE[0] :]

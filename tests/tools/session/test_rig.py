@@ -361,6 +361,13 @@ def test_pose_hold_keeps_every_joint_at_its_measured_angle(network: Network, rob
         assert np.abs(rig.hal.state.position - target).max() < math.radians(0.1)
 
 
+def test_run_after_the_end_of_the_program_ends_after_one_cycle(network: Network, robot: Robot) -> None:
+    with embedded(network, robot) as rig:
+        rig.run(PoseHold(robot), until=lambda state: state.supervisor is ACTIVE)
+        assert rig.hal.ending
+        assert rig.run(PoseHold(robot), until=lambda state: state.cycle > 10_000).cycles == 1
+
+
 @pytest.mark.parametrize("resumes", [False, True])
 def test_hold_ends_the_run_unless_it_resumes_at_start(
     network: Network, robot: Robot, capsys: pytest.CaptureFixture[str], resumes: bool

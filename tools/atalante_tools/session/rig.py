@@ -80,7 +80,7 @@ class Rig:
         record: Callable[[], None] = lambda: None,
         on_stop: Callable[[], None] | None = None,
     ) -> Statistics:
-        """Run the control loop on the clock of the target. The run ends in HOLD.
+        """Run the control loop on the clock of the target. A run in which the robot moved ends in HOLD.
 
         On the wall clock, the process requests real-time priority and locked memory. After the first stop signal, the
         HAL rejects every START and changes to HOLD, and the run ends. Further signals do not interrupt this change. If
@@ -98,20 +98,14 @@ class Rig:
         Raises:
             Stopped: If a signal arrived before the run. The robot then did not move.
         """
-        first = [] if on_stop is None else [on_stop]
-        held = False  # True after the signal that leads to HOLD
+        ends = [self.hal.end] if on_stop is None else [self.hal.end, on_stop]
 
         def end() -> None:
-            nonlocal held
-            if first:
-                first.pop()()
-            else:
-                held = True
-                self.hal.end()
+            (ends.pop() if len(ends) > 1 else ends[0])()
 
         def over(state: State) -> bool:
             # In HOLD, the end condition `until` may never become true, for example if it waits for a number of steps.
-            return until(state) or (held and not self.hal.moving)
+            return until(state) or (self.hal.ending and not self.hal.moving)
 
         with ended_by(end) as stop:
             stop.check()

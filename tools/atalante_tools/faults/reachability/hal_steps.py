@@ -214,7 +214,7 @@ class HalSteps:
         hal, monitor, image, row, pendant = self._hal, self._monitor, self._image, self._row, self._pendant
         self._reset()
         monitor._pendant = pendant
-        hal.state.supervisor = SupervisorState.OFF
+        hal._state.supervisor = SupervisorState.OFF
         monitor._heartbeats.all_reported = False
         accepted = _TAG - 1 - age & 0xFF
         image._e2e.expected[row] = NOTHING if age == NEVER else accepted + 1 & 0xFF
@@ -300,7 +300,7 @@ class HalSteps:
         left = monitor.start_cycles_left
         lowered = JOINT_NODES[0] in monitor.lowered
         for start in {NO_START} if not left else {LAST_START, START} if before.start == START else {min(left, START)}:
-            after = Supervision(hal.state.supervisor, start, monitor.enabling, lowered)
+            after = Supervision(hal._state.supervisor, start, monitor.enabling, lowered)
             yield Decision(after, monitor.start_prevented, after.supervisor is not before.supervisor)
 
     def command(self, state: Supervision, prevented: bool, drive: DriveState, controller: str) -> tuple[int, bool]:
@@ -330,7 +330,7 @@ class HalSteps:
     def _reset(self) -> None:
         """Reset the HAL to values without a fault. The caller then writes the search state into the HAL."""
         hal, monitor = self._hal, self._monitor
-        hal.state.cycle = _CYCLE
+        hal._state.cycle = _CYCLE
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_cycles_left, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
@@ -364,7 +364,7 @@ class HalSteps:
 
     def _write(self, state: Supervision) -> None:
         monitor = self._monitor
-        self._hal.state.supervisor = state.supervisor
+        self._hal._state.supervisor = state.supervisor
         monitor.moving = state.supervisor in MOVING
         monitor.start_cycles_left, monitor.enabling = START_CYCLES[state.start], state.enabling
         if state.lowered:
