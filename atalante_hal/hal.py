@@ -118,8 +118,8 @@ class Hal:
         )
         if legs is not None:
             self._safety_monitor.follow_motion(legs)
-        #: State of the last cycle, for the controller. The HAL itself uses `_state`. So a controller that assigns another array or
-        #: another number to a field by mistake changes no check.
+        #: State of the last cycle, for the controller. The HAL itself uses `_state`. So a controller that assigns to a field by
+        #: mistake changes no check.
         self.state = copy(self._state)
         #: Log of events, such as new diagnostics and changes of the supervisor state.
         #: Repeats of a diagnostic within a second are logged as one event with a count.
