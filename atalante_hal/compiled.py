@@ -38,7 +38,7 @@ R = TypeVar("R")
 #: Name of an empty file that marks the cache folder of a function that creates arrays.
 #: `specialised` compiles a function with numba's reference counting if the function creates arrays, otherwise without it.
 _MARK = "creates-arrays"
-#: Function given to `specialised` -> True if the function creates arrays, so that numba must count references to arrays.
+#: Function given to `specialised` -> whether the function creates arrays. If True, numba must count references to arrays.
 _CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
 #: Functions whose machine code releases the interpreter lock, see `releases_gil`.
 _RELEASES_GIL: set[Callable[..., Any]] = set()

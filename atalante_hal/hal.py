@@ -45,12 +45,12 @@ from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector, 
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: TORQUE_SATURATED is confirmed if the limiter changes a torque in more than this number of consecutive cycles.
+#: TORQUE_SATURATED is confirmed after more than `SATURATED_CYCLES` consecutive cycles in which the limiter changes a torque.
 SATURATED_CYCLES = 200
 #: Largest number of consecutive controller exceptions that the HAL bridges while the robot walks on the ground.
 #: After a bridged exception, the HAL sends the last torques again.
 #: If more than `BRIDGED_ERRORS` consecutive cycles have an exception, CONTROLLER_LOST is confirmed, which leads to HOLD.
-#: A drive bridges the same number (`BRIDGED_ERRORS`) of consecutive lost commands.
+#: A drive, too, bridges up to `BRIDGED_ERRORS` consecutive lost commands.
 BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
@@ -118,8 +118,8 @@ class Hal:
         )
         if legs is not None:
             self._safety_monitor.follow_motion(legs)
-        #: State of the last cycle, for the controller. The HAL itself uses `_state`. So a controller that assigns to a field by
-        #: mistake changes no check.
+        #: State of the last cycle, for the controller. It is a copy of `_state`, which the checks of the HAL use.
+        #: So the checks do not change if a controller assigns to a field by mistake.
         self.state = copy(self._state)
         #: Log of events, such as new diagnostics and changes of the supervisor state.
         #: Repeats of a diagnostic within a second are logged as one event with a count.
@@ -173,7 +173,7 @@ class Hal:
         self.state.cycle, self.state.time = (
             cycle,
             state.time,
-        )  # already here, because a CAN log reads the cycle of each frame
+        )  # set before SYNC is sent, because a CAN log reads the cycle of each frame
         late = 0 if image.all_fresh else transceiver.receive()  # number of late answers to the previous SYNC
         self._commands.synchronise(cycle)
         count = transceiver.receive(late, image, self.patience)

@@ -29,4 +29,4 @@ class LegModel(NamedTuple):
     cell: Vector  # (2, 4, 3) m, position of each force cell in the frame of the foot, which is the last link
     dry: Vector  # (2, 6) Nm, dry friction of the joints
     viscous: Vector  # (2, 6) Nm s/rad, viscous friction of the joints
-    friction_speed: float  # rad/s, at this joint speed, the dry friction is tanh(1) = 76 % of its full value
+    friction_speed: float  # rad/s, joint speed at which the dry friction has tanh(1) = 76 % of its full value

@@ -18,11 +18,11 @@ from atalante_hal.record import COST, LATENESS, OVERRUNS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import PERIOD, Controller, State
 
-#: The robot goes to HOLD if this number of consecutive cycles begin more than one period late.
+#: Number of consecutive late cycles after which the robot goes to HOLD. A late cycle begins more than one period late.
 OVERRUNS_TO_HOLD = 3
-#: The robot goes to HOLD if one cycle begins more than this time [s] late. The watchdog of the drives has the same timeout.
+#: Largest lateness of a single cycle without HOLD [s]. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: The robot goes to HOLD if the loop's delay against the clock grows by more than this time [s] within `DRIFT_CYCLES` cycles.
+#: Largest drift of the loop without HOLD [s]: growth of its delay against the clock within `DRIFT_CYCLES` cycles.
 DRIFT_TO_HOLD = 5e-3
 #: Number of cycles over which the growth of the loop's delay is measured, for the comparison with `DRIFT_TO_HOLD`.
 DRIFT_CYCLES = 50
@@ -122,7 +122,7 @@ class Statistics:
     cycles: int = 0
     overruns: int = 0  # cycles that began more than a period late
     lateness_max: float = 0.0  # s
-    wall: float = 0.0  # s, elapsed time from the first to the last cycle
+    wall: float = 0.0  # elapsed time from the first to the last cycle [s]
     #: Histogram: number of cycles with a cost of 0, 1, 2, ... us. The last element counts all longer cycles.
     costs: list[int] = field(default_factory=lambda: [0] * (COST_BINS + 1))
 

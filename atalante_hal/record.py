@@ -23,7 +23,7 @@ HEADER_FIELDS = (
     "cycle", "time", "supervisor", "assistance_factor", "cost_us", "lateness_us",
     "overruns", "frames", "crc_errors", "dropped", "diagnostics", "diagnostics_high",
 )  # fmt: skip
-#: Index of each of these fields in the record.
+#: Index of each header field in the record.
 (
     CYCLE, TIME, SUPERVISOR, ASSISTANCE_FACTOR, COST, LATENESS,
     OVERRUNS, FRAMES, CRC_ERRORS, DROPPED, DIAGNOSTICS, DIAGNOSTICS_HIGH,

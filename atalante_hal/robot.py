@@ -33,7 +33,7 @@ MOTORS = tuple(
 )
 
 ROBOT_FILE = Path(__file__).with_name("robot.toml")
-#: A joint closer to its position limit than this angle [rad] is regarded as being at its end stop.
+#: Distance between a joint and its position limit below which the joint is regarded as being at its end stop [rad].
 AT_STOP = 0.005
 
 
@@ -47,18 +47,18 @@ class RobotError(ValueError):
 class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
-    look_ahead: float  # s, the limiter predicts the joint position this far ahead, at constant velocity
-    #: If the predicted position is outside a position limit by this angle [rad] or more, the outward torque is 0.
+    look_ahead: float  # time over which the limiter predicts the joint position, at constant velocity [s]
+    #: Distance of the predicted position outside a position limit at which the outward torque has fallen to 0 [rad].
     position_margin: float
-    velocity_margin: float  # rad/s, excess over the velocity limit at which the accelerating torque is 0
+    velocity_margin: float  # excess over the velocity limit at which the accelerating torque has fallen to 0 [rad/s]
 
 
 @dataclass(frozen=True)
 class Derating:
     """Torque limit of a hot drive as a function of its temperature."""
 
-    start: float  # degC, up to this drive temperature, the full torque `torque_max` is allowed
-    end: float  # degC, from this drive temperature on, only the share `floor` of `torque_max` is allowed
+    start: float  # highest drive temperature with the full torque `torque_max` [degC]
+    end: float  # lowest drive temperature with the smallest torque limit, `floor * torque_max` [degC]
     floor: float  # share of torque_max, 0 to 1
 
 
@@ -72,10 +72,10 @@ class Sensors:
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass with which a drive filters its reported velocity
     #: Largest difference [rad] about each axis between the tibia attitude from the encoders and the tibia attitude from the IMUs.
     attitude_error: float
-    #: While an encoder reading is constant, encoder angle minus IMU angle may change by at most this angle [rad].
-    #: If encoder angle minus IMU angle changes by more than `attitude_change`, the joint moves, so its constant encoder is stuck.
+    #: Largest change of (encoder angle - IMU angle) while the encoder reading is constant [rad].
+    #: A larger change shows that the joint moves although its encoder reading is constant. So the encoder is stuck.
     attitude_change: float
-    #: An IMU may be mounted askew. So this factor times the leg rotation [rad] is added to the limit `attitude_change`.
+    #: Factor for IMUs mounted askew: `misalignment` times the leg rotation [rad] is added to the limit `attitude_change`.
     #: Example: with a factor of 0.02, a leg rotation of 0.5 rad increases the limit by 0.01 rad.
     misalignment: float
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
@@ -88,16 +88,16 @@ class Sensors:
 class Thresholds:
     """Thresholds and ramps of the HAL's fault reactions."""
 
-    supply_low: float  # V at a drive; below this voltage the battery is nearly empty
-    supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Walking is permitted while the torque limit of a hot drive is at least this share of the limit of the other leg's drive.
+    supply_low: float  # supply voltage at a drive below which the battery is nearly empty [V]
+    supply_under: float  # supply voltage at a drive below which the drives may soon be unable to hold [V]
+    #: Smallest torque limit of a hot drive with which walking is permitted, as a share of the limit of the other leg's drive.
     #: Example: with 0.5, a hot drive needs a torque limit of at least 100 Nm if the same drive of the other leg has 200 Nm.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest accepted distance [rad] of a joint angle beyond its position limit. A joint with a larger distance is out of range.
     position_tolerance: float
     #: Largest plausible torque [Nm] that a drive reports while it is off.
-    #: While a drive is on, a reported torque of up to `torque_max` plus this value is plausible.
+    #: While a drive is on, a reported torque of up to `torque_max + idle_torque` is plausible.
     idle_torque: float
     #: Largest number of additional frames in a cycle, besides one frame of each cyclic message. More frames raise BUS_FLOOD.
     surplus_frames: float

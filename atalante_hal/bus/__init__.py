@@ -37,7 +37,7 @@ class BusError(Exception):
         self.full: BusFull | None = None
 
     def accepted_of(self, batch: Frames) -> Frames:
-        """Return the frames that `send` passed to the bus before it raised this error, shape (sent,).
+        """Return the frames that `send` passed to the bus before the error, shape (sent,).
 
         Args:
             batch: Frames that were passed to `send`, shape (n,).

@@ -210,7 +210,7 @@ def _asc_text(path: Path) -> Any:
 
 
 def _size_defect(path: Path, stated: int, size: int | None) -> str:
-    """Return how the size of a .blf log differs from the size in its header; empty if the log is complete.
+    """Return the defect of a .blf log, found from its size, as text; empty if the log is complete.
 
     The recorder writes the final size into the header when it closes the log. Until then, the header states a smaller size.
 
@@ -230,7 +230,7 @@ def _size_defect(path: Path, stated: int, size: int | None) -> str:
 
 
 def _bytes(path: Path, count: int, whence: int) -> bytes:
-    """Return `count` bytes from the start of a file, or -`count` bytes from its end if `count` is negative.
+    """Return the first `count` bytes of a file; for a negative `count`, return the last `-count` bytes.
 
     Args:
         path: File to read.

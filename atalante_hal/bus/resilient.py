@@ -13,9 +13,9 @@ from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import Frames
 
-#: While the link is lost, each call of `receive` tries the link once, and waits for at most this time [s].
+#: Longest wait of a call of `receive` while the link is lost [s]. Each of these calls tries the link once.
 RETRY_PERIOD = 0.1
-#: An error message of a lost link is reported after its text has stayed the same for this time [s].
+#: Time for which the error message of a lost link must not change before the message is reported [s].
 #: A removed interface causes the error "down" and soon afterwards the error "removed". So only "removed" is reported.
 SETTLE_TIME = 0.1
 
@@ -88,7 +88,7 @@ class ResilientBus(WrappedBus):
         return count
 
     def _update_down(self, *, proven: bool) -> None:
-        """Store or clear the error message `down` after a call of the wrapped bus that raised no error.
+        """Update the error message `down` after the wrapped bus has sent or received without an error.
 
         `JoinedBus.receive` raises no error while one of its channels works, so check the attribute `loss` of the `JoinedBus`.
 

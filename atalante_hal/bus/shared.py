@@ -38,9 +38,9 @@ _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit words that store the counters and flags of one bus end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
-#: A waiting bus end polls for this time [s] before it sleeps. Computing one control cycle takes less than `_POLL_TIME`.
+#: Time for which a waiting bus end polls before it sleeps [s]. Computing one control cycle takes less than `_POLL_TIME`.
 _POLL_TIME = 500e-6
-#: If a wait takes longer than `_POLL_TIME`, the bus end does not poll in this number of following waits: it sleeps at once.
+#: Number of waits without polling that follow a wait longer than `_POLL_TIME`. In these waits, the bus end sleeps at once.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.

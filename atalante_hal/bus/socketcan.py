@@ -31,7 +31,7 @@ SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
 IFF_UP: Final = 1
-#: Prefix of the names of virtual CAN interfaces, which `ip link add` creates. Any other name is regarded as that of an adapter.
+#: Prefix of the names of virtual CAN interfaces, which `ip link add` creates. All other interfaces are regarded as adapters.
 VIRTUAL: Final = "vcan"
 #: Classes of error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
@@ -40,7 +40,7 @@ LINK_DOWN: Final = errno.ENETDOWN
 LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
 #: Shortest time [s] between two attempts to open a removed interface again.
 REOPEN_PERIOD: Final = 0.1
-#: When the link is lost, the receive queue is emptied with at most this number of calls of `recvmmsg`.
+#: Largest number of calls of `recvmmsg` that empty the receive queue after the link is lost.
 DROPPED_BATCHES: Final = 64
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
@@ -177,7 +177,7 @@ class SocketCanBus:
                 self._tx_pattern = pattern
             sent = 0
             while sent < count:
-                # sendmmsg returns a smaller count if a frame fails. Only the next call returns the error code.
+                # If a frame fails, sendmmsg returns the number of frames before it. Only the next call returns the error code.
                 address = self._tx_address + sent * MMSGHDR.itemsize
                 accepted = self._sendmmsg(self._file, address, count - sent, socket.MSG_DONTWAIT)
                 if accepted < 0:
@@ -293,7 +293,7 @@ class SocketCanBus:
         return error
 
     def _link_error(self, code: int) -> BusDown | None:
-        """Return a `BusDown` and drop the queued frames if the interface is down or removed. Return None for other codes."""
+        """Drop the queued frames and return a `BusDown` if `code` means that the interface is down or removed; else None."""
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()

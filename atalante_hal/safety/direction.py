@@ -63,24 +63,26 @@ STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 #: Integral time of the HAL's position control, which holds the legs during the test [s].
 INTEGRAL = 0.03
-#: A joint that moves farther than this from its initial position ends the start [rad].
+#: Largest distance of a joint from its initial position during the test [rad]. A larger distance ends the start.
 TRAVEL = math.radians(1.5)
 #: First condition for a loaded foot: the mean force on the foot during a test exceeds `LOAD * cell_free`.
 #: Second condition for a loaded foot: on at least two cells, the mean force exceeds half of `LOAD * cell_free`.
 #: `LOAD * cell_free` is about four times the rms noise of the mean force on a foot.
 #: The rms noise of the mean force on one cell is half the rms noise of the mean force on the foot, which has four cells.
 LOAD = 1.0 / 3.0
-#: F is the sum of the forces on a foot in two consecutive cycles. The foot hit the floor if F exceeds `HIT * cell_free`.
-#: In addition, F must differ from twice the median force on the foot in the test by more than `HIT * cell_free`.
+#: F is the sum of the forces on a foot in two consecutive cycles. A foot has hit the floor if two conditions hold for one F.
+#: First condition for a hit: the magnitude of F exceeds `HIT * cell_free`.
+#: Second condition for a hit: F differs from twice the median force on the foot in the test by more than `HIT * cell_free`.
 #: `HIT * cell_free` is about four times the rms noise of F (sum of the forces on a foot in two consecutive cycles).
 #: If the floor stops a moving ankle, F (sum of the foot forces in two consecutive cycles) is at least 1.5 * `HIT * cell_free`.
 HIT = 2.0
 #: Factor by which the pulse is larger in the second test of a joint near its end stop.
 #: The leg weight may press the joint onto the end stop, so the normal pulse of the first test may not move the joint.
 BOOST = 6.0
-#: A joint fails after this number of unsuccessful tests.
+#: Number of unsuccessful tests after which a joint fails.
+#: Exception: a joint does not fail if its foot carried load or hit the floor, unless the joint moved against its torque.
 TRIALS = 2
-#: A joint follows its torque if its mobility (acceleration per torque) is at least this [1/(kg m2)].
+#: Smallest mobility (acceleration per torque) of a joint that follows its torque [1/(kg m2)].
 #: One value for each joint in LEG_JOINTS.
 #: In a suspended robot, the mobility of each joint is at least about twice the value in `MOBILITY`.
 #: This factor of about 2 holds for straight and bent legs, without a patient and with a patient of 110 kg.
@@ -181,7 +183,7 @@ class DirectionProof:
         #: Remaining tests. For each test: joints to test, as indices in JOINTS, and duration of the pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # Extra delay [cycles], measured with a short pulse on more than two joints. Tests of one or two joints use this value.
+        # Extra delay [cycles], measured with a short pulse on more than two joints. Tests of one or two joints use this delay.
         # Reason: a delay fitted to only one or two joints might make a motor with a wrong sign look like a late motor.
         self.late = 0
         #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.

@@ -43,7 +43,7 @@ class EventLog:
 
     def __init__(self, capacity: int = EVENTS_KEPT) -> None:
         self._kept: deque[Event] = deque(maxlen=capacity)
-        #: Number of all events appended so far. The next appended event gets this value as its number.
+        #: Number of all events appended so far. `count` is also the number of the next event.
         self.count = 0
 
     def append(self, event: Event) -> None:

@@ -27,7 +27,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Values of the signal NodeState (CiA 301): 0 once after the node has started, 5 in normal operation.
 #: All other values mean that the node does not work, for example 4 (STOPPED) and 127 (PRE-OPERATIONAL).
 BOOT_UP, OPERATIONAL = 0, 5
-#: A frame has new data if its check result is at most this value: `Check.OK` (0) or `Check.SOME_LOST` (1).
+#: Largest check result of a frame with new data. Such a frame has the result `Check.OK` (0) or `Check.SOME_LOST` (1).
 #: `_FRESH` is a plain integer, because numpy compares enum members ten times slower.
 _FRESH = int(Check.SOME_LOST)
 #: Largest number of frames that `Heartbeats.essential` selects.
@@ -83,7 +83,7 @@ class Heartbeats:
         self._emergency_ids = list(self._emergency_of)
         # All status messages have the same layout.
         (self._state_byte,) = {codec.messages[s.row].signal("NodeState").start // 8 for s in self._statuses}
-        #: Largest uptime of a node [s]. The uptime may continue with 0 after this value.
+        #: Largest uptime that a node can report [s]. After it, the node may report 0 again without a restart.
         (self._last_uptime,) = {codec.messages[s.row].signal("Uptime").maximum for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
@@ -105,8 +105,8 @@ class Heartbeats:
         self._notices: list[tuple[str, Dtc, int]] = []
         #: Nodes whose last status reports a state other than OPERATIONAL. A single BOOT_UP is ignored.
         self._stopped: set[str] = set()
-        #: Nodes that were reset: they restarted, see `booted`, or reported a state other than OPERATIONAL at least once since the
-        #: last `evaluate`.
+        #: Nodes that were reset since the last `evaluate`: they restarted (see `booted`), or reported a state other than
+        #: OPERATIONAL.
         #: The first status message of a node is ignored, because the first start of a node is not a reset.
         self._reset: set[str] = set()
         #: Row of a message in the process image -> counter that rises if two nodes seem to send this message, 0 to `FULL`.
@@ -277,7 +277,7 @@ class Heartbeats:
         elif state != BOOT_UP or before == BOOT_UP:
             self._stopped.add(status.node)
         uptime, uptime_before = values[status.uptime], self.image.values_before[status.uptime]
-        # A pendant that takes over from another one reports its own uptime.
+        # The pendant is excluded, because the uptime also decreases if a second pendant replaces the first pendant.
         decreased = status.node in self._needed and uptime < uptime_before < self._last_uptime
         restarted = state == BOOT_UP or decreased
         if restarted:

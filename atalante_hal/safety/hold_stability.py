@@ -33,34 +33,34 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 from atalante_hal.wire.cia402 import DriveState
 
-#: A reversal counts only if the joint exceeds this speed [rad/s] before and after the reversal.
+#: Speed that a joint must exceed before and after a reversal, so that the reversal counts [rad/s].
 SPEED: Final = 0.5
 #: Longest time between two reversals of an oscillation [cycles].
 INTERVAL: Final = 100
-#: A joint is regarded as oscillating after this number of consecutive reversals.
+#: Number of consecutive reversals after which a joint is regarded as oscillating.
 REVERSALS: Final = 6
 #: Lowest and highest reported torque that count as overload, as shares of the drive's torque limit.
 #: A drive cannot produce more than 105 % of its torque limit. A higher reported torque is a wrong value, not an overload.
 SATURATED: Final = (0.9, 1.05)
-#: A drive is reported after this number of consecutive faulty cycles: cycles with overload, or with a motor without torque.
+#: Number of consecutive faulty cycles (overload or motor without torque) after which a drive is reported.
 OVERLOADED: Final = 20
-#: Overload is counted only while a joint is at least this far from the position in which the hold began [rad].
-#: A drive that holds its joint keeps the joint within this distance. So a wrong reported torque alone is no overload.
+#: Overload is counted only at a distance of at least `AWAY` from the position in which the hold began [rad].
+#: A drive that holds its joint keeps the distance smaller than `AWAY`. So a wrong reported torque alone is no overload.
 AWAY: Final = math.radians(1.0)
-#: A drive without torque is reported only if its joint is at least this far from the position in which the hold began [rad].
+#: A motor without torque is counted only at a distance of at least `SUNK` from the position in which the hold began [rad].
 #: At the distance `SUNK`, a working drive with the stiffness `Robot.hold_kp` requests more than half of `Robot.torque_max`.
 SUNK: Final = math.radians(3.0)
-#: A drive without torque reports less than this share of its torque limit.
+#: Torque below which a motor is regarded as being without torque, as a share of the drive's torque limit.
 POWERLESS: Final = 0.1
-#: If encoder and IMUs of a joint differ by more than this angle [rad], the encoder may be wrong, so the joint may not have
-#: moved. Then its drive is not reported as a drive without torque.
+#: Largest difference between the encoder angle and the IMU angle of a joint that confirms the encoder [rad].
+#: Without this confirmation, the joint may not have moved. So its motor is not counted as a motor without torque.
 ENCODER_ERROR: Final = math.radians(1.0)
 #: The count of faulty cycles restarts if the joint moves back or slows down, because its drive then works.
 #: - Moves back: the joint moves towards the position in which the hold began, faster than `SLOWER` [rad/s].
-#: - Slows down: the joint moves away from this position, but slower by more than `SLOWER` [rad/s] than in the first faulty cycle.
+#: - Slows down: the joint still moves away, but its speed is more than `SLOWER` below the speed in the first faulty cycle.
 #: `SLOWER` is larger than the noise of the velocities.
 SLOWER: Final = 0.05
-#: `_watch_load` skips a joint in each cycle in which the values of the joint are older than this [cycles].
+#: Largest age of the values of a joint at which `_watch_load` evaluates the joint [cycles].
 AGE: Final = 4
 
 
@@ -84,10 +84,10 @@ class Swings(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Record with which `_watch_load` detects overloaded drives and motors without torque. Each field has the shape (12,)."""
+    """Memory of `_watch_load`, which detects overload and motors without torque. Each field has the shape (12,)."""
 
     start: Vector  # position of the joint when the hold began [rad]; NaN if the drive does not hold its position
-    speed: Vector  # speed in the first faulty cycle [rad/s]: > 0 if the joint moved away from `start`, < 0 if it moved back
+    speed: Vector  # speed in the first faulty cycle [rad/s]: positive away from `start`, negative towards `start`
     cycles: Vector  # number of consecutive faulty cycles: the drive is overloaded, or its motor has no torque
 
 

@@ -31,13 +31,13 @@ HALF: Final = 8
 SPAN: Final = 2 * HALF + 1
 #: A torque in `Sample.sent` of cycle n moves the joints in cycle n + DELAY, if no frame and no motor is late.
 DELAY: Final = 1
-#: A torque may move the joints up to this many cycles later than `DELAY`, because states, commands or motors may be late.
+#: Largest extra delay from torque to motion, in addition to `DELAY` [cycles]. States, commands or motors may be late.
 MORE: Final = 3
-#: No torques are computed from a position that is older than this [cycles].
+#: Largest age of a position from which torques are computed [cycles].
 #: A node that always answers one cycle late has positions of age 1. `LATE` permits this age.
 LATE: Final = 1
-#: The pelvis IMU or a foot is stuck if its values have not changed for more than this number of cycles.
-#: No torques are computed from the values of a stuck sensor.
+#: Largest number of consecutive cycles in which the values of a working sensor (pelvis IMU, foot) may stay the same.
+#: If the values stay the same for longer, the sensor is stuck, and no torques are computed from its values.
 REPEATED: Final = 2
 _LEG: Final = len(LEG_JOINTS)
 _PELVIS: Final = IMUS.index("pelvis")

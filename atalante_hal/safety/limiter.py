@@ -88,9 +88,9 @@ class JointLimits(NamedTuple):
     position_min: Vector  # (12,) lowest position [rad]
     position_max: Vector  # (12,) highest position [rad]
     velocity_max: Vector  # (12,) highest velocity [rad/s]
-    look_ahead: float  # the envelope uses the position that the joint has after this time at constant velocity [s]
-    position_margin: float  # distance beyond a position limit [rad]; at this distance, no outward torque is allowed
-    velocity_margin: float  # excess over `velocity_max` [rad/s]; at this excess, no accelerating torque is allowed
+    look_ahead: float  # time over which the envelope predicts the joint position, at constant velocity [s]
+    position_margin: float  # distance of the predicted position outside a limit at which the outward torque is 0 [rad]
+    velocity_margin: float  # excess over `velocity_max` at which the accelerating torque is 0 [rad/s]
     inertia: Vector  # (12,) smallest effective inertia of each joint [kg m2]
     period: float  # duration of a cycle [s]
     filter_lag: float  # delay of the low-pass of the reported velocity [s]

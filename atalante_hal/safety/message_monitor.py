@@ -62,7 +62,7 @@ CONFIRMED = {
     Check.CONFLICT: Dtc.E2E_FROZEN,
 }
 #: E2E check results of rejected frames that may come from a second sender.
-#: If a message has a frame with such a result and another intact frame in the same cycle, two nodes send this message.
+#: Two nodes send a message if it has at least two intact frames in one cycle, one of them rejected with such a result.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
@@ -76,7 +76,7 @@ _DISTURBANCES = {
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: A joint in one of `Tolerance.legs` leads to HOLD when the age of its data reaches this multiple of its timeout.
+#: Age of the data at which a joint in one of `Tolerance.legs` leads to HOLD, as a multiple of the DBC timeout.
 BRIEF_TIMEOUTS = 2
 
 
@@ -178,7 +178,7 @@ class MessageMonitor:
         rivals = rivals_of(image.refused, checks) if image.refused else frozenset()
         for row, result in image.refused:
             if result is Check.CONFLICT and row in rivals:
-                continue  # `_check_senders` raises the diagnostic for two senders
+                continue  # `_check_senders` raises NODE_DUPLICATE for this row
             dtc = self._invalid[row] if result is Check.INVALID else PENDING[result]
             value = ages[row] if ages[row] < NEVER else 0
             memory.raise_dtc(cycle, dtc, self._senders[row], value=value, confirmed=False)
@@ -252,7 +252,7 @@ class MessageMonitor:
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
         # `tolerance.longer` delays the timeout only in cycles without an accepted frame.
-        # With an accepted frame, the DBC timeout applies: data that has reached this age is ignored by the plausibility checks.
+        # With an accepted frame, the DBC timeout applies, because the plausibility checks ignore data of that age.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

@@ -42,7 +42,7 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive rejected positions of an encoder after which ENC_JUMP is confirmed.
 JUMPS_TO_CONFIRM = 5
-#: Overspeed is confirmed after this number of consecutive velocities above the top speed.
+#: Number of consecutive velocities above the top speed after which overspeed is confirmed.
 #: A single velocity above the top speed may come from a small jump of the encoder.
 OVERSPEED_TO_CONFIRM = 2
 #: Number of consecutive wrong velocities of a drive after which ENC_VELOCITY is raised.
@@ -291,7 +291,7 @@ class EncoderChecks:
         return Finding(Dtc.ENC_JUMP, JOINT_NODES[joint], size, confirmed, text)
 
     def _exchanged(self, joint: int) -> bool:
-        """Return whether the encoder of a joint reads the position of the same joint of the other leg, and vice versa.
+        """Return whether the encoders of a joint and of its counterpart in the other leg are exchanged.
 
         Args:
             joint: index of the joint in JOINTS.

@@ -15,7 +15,7 @@ from atalante_hal.safety.plausibility.inertial import upward
 from atalante_hal.safety.plausibility.signals import Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
-#: The robot has fallen if its trunk leans by more than this angle [rad].
+#: Lean of the trunk above which the robot has fallen [rad].
 FALLEN = math.radians(35.0)
 _PELVIS = IMUS.index("pelvis")
 _TRUNK = IMUS.index("torso"), _PELVIS

@@ -26,13 +26,13 @@ from atalante_hal.robot import CELLS, FEET, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.signals import Signals
 
-#: A cell is reported as faulty after it has contradicted the other cells for this time [cycles].
+#: Time for which the cells of a foot must contradict each other, or report a pull, before the fault is reported [cycles].
 CELL_CYCLES = 256
-#: The check for two swinging feet begins when both feet have carried load together for this time [cycles].
+#: Time for which both feet must carry load together before the check for two swinging feet begins [cycles].
 STANDING_CYCLES = 500
-#: It is a fault if both feet swing for this time [cycles]. If a foot lands late in a walk, both feet swing for 30 cycles.
+#: Time after which a swing of both feet is a fault [cycles]. If a foot lands late in a walk, both feet swing for 30 cycles.
 SWING_CYCLES = 60
-#: After this time without ground contact [cycles], the robot is regarded as lifted on purpose.
+#: Time without ground contact after which the robot is regarded as lifted on purpose [cycles].
 LIFTED_CYCLES = 140
 
 
@@ -49,9 +49,9 @@ class FootChecks:
         self._force, self._forces = now.force, now.forces
         self._free, self._twist = robot.sensors.cell_free, robot.sensors.cell_twist
         self._every = every
-        # No cell carries load if the sum of the squares of all force components is at most this value [N^2].
+        # Largest sum of the squares of all force components at which certainly no cell carries load [N^2].
         self._free_squared = self._free**2
-        #: Index of the swing leg in FEET; None unless exactly one foot is on the ground.
+        #: Index of the swing leg in FEET; None if both feet or no foot is on the ground.
         self.swing: int | None = None
         # Time for which no foot has been on the ground [cycles]. It does not grow while a foot has no new values.
         self._swinging = LIFTED_CYCLES
@@ -62,7 +62,7 @@ class FootChecks:
         self._contradicts = [0] * len(FEET)
         #: Foot with contradicting cells -> force FL + RR - FR - RL [N], and index of the faulty cell (None if it is unknown).
         self._twisted: dict[int, tuple[float, int | None]] = {}
-        self._pulls = [0] * len(FEET)  # time for which each foot has reported an impossible pull of the floor [cycles]
+        self._pulls = [0] * len(FEET)  # time for which each foot has reported that the floor pulls it [cycles]
         self._pulled: dict[int, float] = {}  # foot that reports a pull for too long -> sum of its vertical forces [N]
 
     def evaluate(self, updated: tuple[bool, bool]) -> bool:

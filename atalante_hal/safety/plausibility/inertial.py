@@ -46,7 +46,7 @@ from atalante_hal.safety.plausibility.signals import Ages, Cycles, Signals
 from atalante_hal.types import GRAVITY, Vector
 from atalante_hal.wire.process_image import NEVER
 
-#: Number of samples in each mean. Before this number is reached, a mean is over all samples since the start.
+#: Number of samples in each running mean. With fewer samples since the start, the mean is over all of them.
 SAMPLES = 64
 #: For each IMU: number of samples after which its means are first compared with their limits.
 #: Torso and pelvis need only 4 samples, so their faults are found before READY.
@@ -56,17 +56,17 @@ FIRST_SAMPLES = (4, 4, 16, 16)
 _FORCE_ERROR = 3.0
 #: Each sample of the difference between specific force and gravity is clipped to this magnitude [m/s2].
 _FORCE_CLIP = 5.0
-#: If an IMU turns faster than this [rad/s], its specific force is not compared with gravity.
+#: Angular velocity of an IMU above which its specific force is not compared with gravity [rad/s].
 #: Fast motions cause large accelerations, for example when the drives are switched off and the legs fall to their end stops.
 _MOVING_RATE = 0.5
 #: Largest rms difference between gyroscope and rate of change of the attitude while the IMU is at rest [rad/s].
 #: `_RATE_ERROR` also limits the rms difference between the gyroscopes of torso and pelvis.
 _RATE_ERROR = 0.1
-#: While an IMU turns, its rms difference may be larger: the limit is sqrt(_RATE_ERROR^2 + _RATE_SHARE * mean square of its rate).
+#: Limit of the rms difference while an IMU turns: sqrt(_RATE_ERROR^2 + _RATE_SHARE * mean square of the angular velocity).
 _RATE_SHARE = 0.25
-#: A reading is constant if this number of consecutive samples repeats it exactly.
+#: Number of consecutive samples that must repeat a reading exactly before the reading is regarded as constant.
 _CONSTANT = 4
-#: Largest turn of the attitude that a constant reading may miss [rad].
+#: Largest permitted missed turn, see `Record.missed` [rad].
 _TURN = 0.01
 _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 
@@ -99,7 +99,7 @@ class Record(NamedTuple):
     accel: Vector  # (4, 3) specific force in the last sample [m/s2]
     #: Number of samples that repeated the reading of each axis, shape (4, 6): gyroscope, then accelerometer.
     repeats: Vector
-    #: Turn of the attitude that the constant reading of each axis has missed, shape (4, 6) [rad].
+    #: Missed turn of each axis, shape (4, 6) [rad]: rotation of the IMU that the constant reading of the axis does not contain.
     #: A missed turn beyond its limit is kept until the reading changes or the values are too old.
     missed: Vector
 
@@ -110,7 +110,7 @@ class Excess(NamedTuple):
     force: Vector  # (4,) magnitude of the mean difference between specific force and gravity [m/s2]
     rate: Vector  # (5,) largest rms difference in each row of `Record.rate_error` [rad/s]
     tilt: Vector  # (1,) angle between the upward directions of torso and pelvis [rad]
-    missed: Vector  # (4,) largest turn of the attitude that a constant reading has missed [rad]
+    missed: Vector  # (4,) largest missed turn of the axes of each IMU, see `Record.missed` [rad]
 
 
 class Inertial:
@@ -137,7 +137,7 @@ class Inertial:
         )  # fmt: skip
         self._intervals = itertools.cycle(intervals)
         self._interval = 0  # time since the last call of `evaluate` [cycles]
-        #: Arguments of the function `follow` from the third on. The array objects are the same in every call.
+        #: Third and later arguments of the function `follow`. The array objects are the same in every call.
         self._readings = (
             Readings(now.quaternion, now.gyro, now.accel), record, self._excess, limits,
             period, 2.0 * robot.sensors.attitude_error,
@@ -145,8 +145,8 @@ class Inertial:
         never = np.full(imus, NEVER)
         self._follow = specialised(follow, never, self._interval, *self._readings)
         self._found: tuple[Finding, ...] = ()
-        #: Indices in IMUS of the IMUs that contradict gravity or their own attitude. If only torso IMU and pelvis IMU contradict
-        #: each other, the wrong one is unknown, and the set contains neither of them.
+        #: Indices in IMUS of the IMUs that contradict gravity or their own attitude.
+        #: If torso IMU and pelvis IMU contradict only each other, the faulty one is unknown, so neither is in the set.
         self.implausible: frozenset[int] = frozenset()
 
     def evaluate(self, ages: Ages | None) -> bool:
@@ -203,7 +203,9 @@ def follow(
         elif imu in (_TORSO, _PELVIS):
             comparable = False
         if not used:
-            for axis in range(6):  # a skipped sample ends the count, but not a finding
+            # A skipped sample resets repeats and missed turns.
+            # Exception: a missed turn beyond its limit is kept until the values are too old.
+            for axis in range(6):
                 if age[imu] >= NEVER or missed_turn(record, imu, axis) == 0.0:
                     record.repeats[imu, axis] = record.missed[imu, axis] = 0.0
         if age[imu] >= NEVER:  # the values are too old: another check reports this IMU
@@ -251,7 +253,7 @@ def add(imu: int, now: Readings, record: Record, time: float) -> None:
 
 
 def add_missed(imu: int, now: Readings, record: Record, turn: tuple[float, float, float], time: float) -> None:
-    """Update the missed turns of one IMU: add the rotation since the last sample that its constant readings did not measure.
+    """Add to the missed turns of one IMU the rotation that its constant readings did not measure since the last sample.
 
     Args:
         imu: index of the IMU in IMUS.
@@ -271,7 +273,7 @@ def add_missed(imu: int, now: Readings, record: Record, turn: tuple[float, float
 
 
 def add_repeat(record: Record, imu: int, axis: int, same: bool, missed: float) -> None:
-    """Count a repeated reading, and add the rotation that it does not contain to the missed turn.
+    """Count a repeated reading, and add to the missed turn the rotation that the reading does not contain.
 
     If the reading has changed, set the number of repeats and the missed turn to 0.
 
@@ -290,7 +292,7 @@ def add_repeat(record: Record, imu: int, axis: int, same: bool, missed: float) -
 
 
 def missed_turn(record: Record, imu: int, axis: int) -> float:
-    """Return the turn that the reading of one axis has missed [rad]; 0 if it is within its limit or the reading is not constant.
+    """Return the missed turn of one axis [rad]; 0 if the missed turn is within its limit or the reading is not constant.
 
     Args:
         record: repeats and missed turns.

@@ -56,12 +56,12 @@ _FILTER_TIME = 0.15
 _MEAN_TIME = 0.75
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 2.0
-#: An error of a knee angle is computed only while the thigh turns: the rms of u in `knee_error` must exceed this value [m/rad].
+#: Rms of u in `knee_error` above which the thigh turns enough to compute an error of the knee angle [m/rad].
 #: u in `knee_error` is the filtered motion of the tibia IMU per radian of knee error. In a walk, its rms is about 0.012 m/rad.
 _LEAST_LEVER = 0.007
-#: An error of a knee angle is reported only if it explains more than this share of the mean square of v in `knee_error`.
+#: Share of the mean square of v in `knee_error` that an error of a knee angle must explain, so that the error is reported.
 #: v in `knee_error` is the filtered difference between the measured and the computed position of the tibia IMU.
-#: Wrong segment lengths cause such a difference, too. This part is subtracted from v.
+#: The part of the difference that wrong segment lengths explain is already subtracted from v.
 _SHARE = 0.25
 #: Number of low-passes for each axis of a leg.
 _FILTERS = 11
@@ -95,7 +95,7 @@ class Filters(NamedTuple):
     - d is the difference [m]: measured minus computed position of the tibia IMU.
     """
 
-    low: Vector  # (2, 33) outputs of the low-passes: one row per leg, with three axes of `_FILTERS` low-passes each
+    low: Vector  # (2, 33) outputs of the low-passes: one row per leg, with `_FILTERS` low-passes for each of three axes
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
     moments: Vector  # (2, 6) running means of the products ss, sg, gg, sd, gd and dd: one row per leg
 
