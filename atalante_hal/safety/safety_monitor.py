@@ -53,8 +53,8 @@ from atalante_hal.wire.process_image import ReceiveImage
 #: A walking robot ends its current step, makes a stop step and shifts its weight back in less than `FINISH_STEP_CYCLES`.
 FINISH_STEP_CYCLES = 6000
 
-#: If a drive does not report QUICK STOP ACTIVE within this time [cycles] after the command QUICK_STOP, the command was lost.
-#: The answer to a command takes two cycles, and frames may be late by four cycles.
+#: Longest time from the command QUICK_STOP to the report QUICK STOP ACTIVE of the drive [cycles].
+#: After this time, the command counts as lost. The answer to a command takes two cycles, and may be late by four more cycles.
 RECALL_CYCLES = 6
 
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
@@ -151,7 +151,7 @@ class SafetyMonitor:
         self.torque_motion: TorqueMotion | None = None
         #: DBC names of the drives that stay off until a start passes its direction test (attribute `proof`).
         #: 1. Drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the direction test.
-        #: 2. If START was pressed in READY or before any start had passed the direction test: drives that were off then.
+        #: 2. Drives that were off when START was pressed, if this was in READY or before any start had passed the test.
         #: A start enables the drives in `_kept_off` for the direction test. If the start fails, they are switched off again.
         self._kept_off: set[str] = set()
         self._tested = False  # True after a start has passed the direction test
@@ -172,7 +172,7 @@ class SafetyMonitor:
         self._drives_evaluated = b""  # drive states and temperatures of the last evaluation
 
     def follow_motion(self, legs: LegModel) -> None:
-        """Compare the motion of the joints with the sent torques from now on.
+        """Begin to compare the motion of the joints with the sent torques.
 
         Args:
             legs: model of the legs with the patient.
@@ -205,7 +205,7 @@ class SafetyMonitor:
         return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
 
     def _check_joints(self) -> tuple[Finding, ...]:
-        """Check the drive torques if the robot moves. Check the held joints if it does not. Return the faults.
+        """Check the drive torques in the states `MOVING`, and the held joints in all other states. Return the faults.
 
         A drive with a wrong torque, or one that does not hold its joint, stays off until a START in which the test of the joint
         directions is passed.
@@ -276,7 +276,7 @@ class SafetyMonitor:
         self._ending, self._steady = True, False
 
     def check_timeouts(self) -> None:
-        """Request an evaluation of the next cycle if a status message timed out or the repeats of an event must be logged.
+        """Request an evaluation of the next cycle if a status message has timed out or if event repeats must be logged.
 
         The fault memory counts equal events for some time (counting window). When this time is over, it logs their number. Call
         this method periodically, because cycles without a fault are not evaluated.
@@ -378,7 +378,7 @@ class SafetyMonitor:
         return ends | _REJECTED | {Dtc.IMU_IMPLAUSIBLE} if unusable.issuperset(TRUNK_NODES) else ends
 
     def _tolerance(self) -> Tolerance:
-        """Return the tolerance of timeouts in this cycle.
+        """Return in which legs a brief timeout is tolerated in this cycle.
 
         In a walk on the ground, timeouts of both legs are tolerated. Otherwise, timeouts are tolerated only in a swing leg while
         the other foot is on the ground.
@@ -486,7 +486,7 @@ class SafetyMonitor:
         self._stalled = 0
         if not self._proof_begun:
             # The direction test starts from the torques that the HAL sent last (`limiter.last`).
-            # While `enabling` is True, these torques follow the torques that the drives report. So wait until it is True.
+            # While `enabling` is True, they follow the torques that the drives report. So wait until `enabling` is True.
             if not self.enabling:
                 return None
             self._proof_begun = True

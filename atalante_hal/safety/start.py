@@ -21,9 +21,9 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
 
-#: All drives must be in OPERATION ENABLED within this time after START [cycles].
+#: Time limit of a start [cycles]. In READY and HOLD, all drives must be enabled and the direction test must end before the limit.
 ENABLE_CYCLES = 200
-#: A start ends if no drive changes its state for this time [cycles].
+#: Time without a state change of any drive after which a start in READY or HOLD ends [cycles].
 #: Even if four consecutive commands and then four consecutive answers of a drive are lost, the start does not end.
 STALLED_CYCLES = 10
 #: Largest speed of a joint at which START is accepted in HOLD [rad/s]. The test of the joint directions needs joints at rest.
@@ -119,7 +119,7 @@ def _reason(request: StartRequest) -> str:
 
 
 def _failure(request: StartRequest) -> str:
-    """Return why the start failed, with the names of the drives that delay it, or an empty text if the start may continue."""
+    """Return why the start failed and which drives delay it. Return an empty text if the start may continue."""
     if not request.cycles_left:
         within = f"within {ENABLE_CYCLES} cycles"
     elif request.supervisor in _ENABLING and request.stalled >= STALLED_CYCLES:
@@ -210,7 +210,7 @@ def entry_text(state: SupervisorState, missing: Collection[str], stop_requested:
 
 
 def moving_joint(velocity: Vector, on: npt.NDArray[np.bool_]) -> str:
-    """Return a sentence about the fastest joint whose drive is on; empty if all these joints are at rest.
+    """Return a sentence about the fastest joint whose drive is on; empty if every joint whose drive is on is at rest.
 
     Args:
         velocity: joint velocities, shape (12,) [rad/s].

@@ -26,7 +26,8 @@ class Conditions:
     #: True if HOLD is requested, if STOP is requested outside a walk on the ground, or if the program is ending.
     stop_requested: bool = False
     start_wanted: bool = False  # START was pressed, and this press can still change the state
-    step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
+    #: True if the walking step has ended, if the robot does not walk, or if FINISH_STEP took too long.
+    step_finished: bool = False
     #: True during a walk on the ground if STOP is requested, the dead-man switch is released, or the pendant has timed out.
     #: False if HOLD is requested.
     walk_end_requested: bool = False
@@ -40,7 +41,7 @@ _HOLD, _LOWER, _FAULT = SupervisorState.HOLD, SupervisorState.LOWER, SupervisorS
 
 #: States in which the HAL sends the controller's torques to the drives.
 MOVING = frozenset({_ACTIVE, _FULL_ASSIST, _FINISH_STEP})
-#: Reaction of a diagnostic -> state that the reaction demands from a moving robot.
+#: State that each reaction of a diagnostic demands from a moving robot.
 #: If the robot is already in a worse state (further down in this table), the state does not change.
 _STATE_OF = {
     Reaction.INFO: _ACTIVE,

@@ -66,17 +66,17 @@ _OTHER_SHARE: Final = 0.25
 #: Decay factors of the two sets of `Deviations.sums`. Each check multiplies a set by its factor, and then adds the new torques.
 #: The set with 0.8 covers about the last 5 checks (20 cycles), the set with 0.96 about the last 25 checks (100 cycles).
 DECAY: Final = (0.8, 0.96)
-#: Number of checks at the start of a deviation that are not added to `Deviations.sums`.
+#: Number of checks that are left out of `Deviations.sums` at the start of a deviation.
 #: In these first checks, the torques are averages that also contain cycles before the deviation.
 LEFT_OUT: Final = 2
-#: A deviation ends if more than this number of consecutive checks find no deviation.
+#: Longest gap in a deviation [checks]. If more consecutive checks find no deviation, the deviation ends.
 PAUSE: Final = 5
-#: A check is not added to `Deviations.sums` if its deviation is below this fraction of `Deviations.peak`, the recent maximum.
-#: Reason: a decreasing deviation may come from a push on the joint that is ending.
+#: Smallest deviation that is added to `Deviations.sums`, as a fraction of the recent maximum `Deviations.peak`.
+#: Reason: while a push on the joint ends, the deviation decreases.
 _PEAK_SHARE: Final = 0.8
 #: Factor by which each check with a deviation reduces `Deviations.peak`, so that an old maximum is forgotten.
 _PEAK_DECAY: Final = 0.97
-#: A motor is suspected only if the weighted number of its checks is at least this value.
+#: Smallest weighted number of checks with which a motor can be suspected.
 #: The weighted number is `Deviations.sums[window, joint, 0]`: each check adds 1, and older checks count less.
 #: Three checks are enough: their weighted number is at least 1 + 0.8 + 0.8^2 = 2.44.
 #: Two checks are not enough: their weighted number is at most 1 + 0.96 = 1.96.
@@ -255,7 +255,7 @@ class TorqueMotion:
         limits = Tolerances(robot.torque_error, robot.position_min + AT_STOP, robot.position_max - AT_STOP)
         self._arguments = sample, model, limits, self._memory
         # The arrays of the state are read-only. For numba, read-only and writable arrays have different types.
-        # `_check` is compiled for writable arrays. This machine code also accepts read-only arrays, see `specialised`.
+        # `_check` is compiled for writable arrays. The compiled code also accepts read-only arrays, see `specialised`.
         writable = Sample._make(np.zeros_like(values) for values in sample)
         self._check = specialised(_check, 0, writable, *self._arguments[1:])
         self.restart()

@@ -31,10 +31,10 @@ from atalante_hal.types import Vector
 #: Without faults, the drive applies a command one cycle after the HAL sent it. The torque follows within two more cycles, and
 #: the drive reports it in the next cycle.
 SPAN: Final = 12
-#: A reported torque may lie outside the range of the last sent torques (smallest to largest) by this tolerance.
-#: The tolerance is a fraction of the breakaway torque of the joint.
+#: Tolerance of a reported torque, as a fraction of the breakaway torque of the joint.
+#: The reported torque may be below the smallest or above the largest of the last sent torques by the tolerance.
 TOLERANCE: Final = 0.2
-#: A drive is reported after this number of consecutive cycles with a wrong torque.
+#: Number of consecutive cycles with a wrong torque after which a drive is reported.
 CONFIRM: Final = 5
 
 

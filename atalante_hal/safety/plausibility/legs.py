@@ -61,8 +61,8 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive samples after which an encoder drift is reported.
 DRIFT_SAMPLES = 4
-#: After an IMU of a leg was silent, the leg is not compared in this number of samples.
-#: In this time, at least one status message of the IMU (every 100 cycles) arrives, and shows whether the IMU has restarted.
+#: Number of samples in which a leg is not compared after one of its IMUs was silent.
+#: During these samples, a status message of the IMU arrives (sent every 100 cycles). It shows whether the IMU has restarted.
 SILENT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
@@ -72,18 +72,18 @@ EXCHANGE_SAMPLES = 2
 #: d is the left encoder reading minus the right encoder reading. Each error may deviate from d or -d by `_AGREEMENT` * |d|.
 #: Example: with encoder readings of 5 degrees (left) and 2 degrees (right), an error may deviate by 0.35 * (5 - 2) degrees.
 _AGREEMENT = 0.35
-#: The standstill check ignores a change of the error (encoder minus IMU) of up to this angle per sample [rad].
+#: Largest change of the error (encoder minus IMU) per sample that the standstill check ignores [rad].
 #: `_IMU_DRIFT` applies while the gyros contradict the encoders.
 #: `_IMU_DRIFT` is over ten times the heading drift of intact IMUs between two samples.
 _IMU_DRIFT = 2e-5
-#: `_IMU_WANDER` replaces `_IMU_DRIFT` while the gyros agree with the encoders [rad].
+#: Largest ignored change per sample while the gyros agree with the encoders [rad]. Then it replaces `_IMU_DRIFT`.
 #: Emulated IMUs have random attitude errors of 4 mrad rms (time constant 10 s), interpolated over 128 cycles.
 #: These attitude errors change the error (encoder minus IMU) by 0.11 mrad rms in 16 cycles.
 _IMU_WANDER = 2e-4
-#: The gyros agree with the encoders about an axis if the two angular velocities differ by at most this value [rad/s].
+#: Largest difference of the velocities from encoders and gyros about an axis at which the two agree [rad/s].
 #: `_GYRO_ERROR` is 3.6 times the rms noise of the difference of two gyros.
 _GYRO_ERROR = 0.02
-#: The headings of intact IMUs drift slowly. The estimate of this drift changes by at most this angle in each sample [rad].
+#: Largest change of the estimated heading drift per sample [rad]. The headings of intact IMUs drift slowly.
 #: The heading drift of a leg is estimated every 32 cycles, so the estimate follows a drift of at most 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
@@ -92,7 +92,7 @@ _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
 #: Index of TH in `_AXES`. The encoder angle of TH minus its angle from the IMUs shows the heading drift of the IMUs.
 _HEADING = _AXES.index(("TH",))
-#: Index of the sum SH + SK in `_AXES`. Its error (encoders minus IMUs) in the first comparison shows how askew the IMUs are.
+#: Index of the sum SH + SK in `_AXES`. IMUs that are mounted askew cause its error in the first comparison.
 _SAGITTAL = _AXES.index(("SH", "SK"))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
@@ -143,7 +143,7 @@ class Legs:
         self._errors: list[tuple[float, float, float] | None] = [None for _ in SIDES]
         self._heading_lost = [False for _ in SIDES]  # for each leg: whether its heading must be measured again
         self._waits = [0 for _ in SIDES]  # for each leg: number of samples until it is compared again
-        self._comparisons = [0 for _ in SIDES]  # for each leg: number of samples with a comparison since the last wait
+        self._comparisons = [0 for _ in SIDES]  # for each leg: number of comparisons since its last wait began
         #: For each leg: whether the drive of TH has restarted since the last comparison.
         self._referenced = [False for _ in SIDES]
         self.heading: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
@@ -151,7 +151,8 @@ class Legs:
         self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: For each joint: comparison of encoders and IMUs when the encoder reading of this joint last changed.
+        #: For each joint: comparison of the last sample in which its encoder reading changed.
+        #: While the reading is constant, the error of this comparison follows a slow drift of the IMUs.
         self._moved: list[_Comparison | None] = [None] * len(JOINTS)
         #: Number of consecutive samples in which the leg turned but the encoder reading was constant, by joint index.
         self._turned: dict[int, int] = {}
@@ -320,7 +321,7 @@ class Legs:
         self._set_heading(leg, drift)
 
     def _is_heading(self, leg: int, drift: float) -> bool:
-        """Return whether a measured heading drift agrees with the estimate of a leg."""
+        """Return whether a measured heading drift agrees with the estimated heading drift of a leg."""
         return abs(math.remainder(drift - self._heading_drift[leg], 2.0 * math.pi)) <= self._attitude_error
 
     def _set_heading(self, leg: int, drift: float) -> None:
@@ -407,7 +408,7 @@ class Legs:
 
 
 def hip_angles(pelvis: Sequence[float], tibia: Sequence[float]) -> tuple[float, float, float]:
-    """Return the hip and knee angles FH, TH and SH + SK [rad].
+    """Return the angles FH, TH and SH + SK of a leg, computed from the attitudes of its two IMUs [rad].
 
     The rotation from the tibia frame to the pelvis frame is Rx(FH) Rz(TH) Ry(SH + SK).
 
@@ -467,7 +468,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float, rate: float) -> _Comparison:
-    """Return a copy of the comparison `moved`, with a slow drift of the IMUs added to its error (encoder minus IMU).
+    """Return a copy of the comparison `moved` whose error (encoder minus IMU) follows a slow drift of the IMUs.
 
     Args:
         moved: comparison when the encoder reading of the joint last changed.

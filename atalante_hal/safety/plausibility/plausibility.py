@@ -103,14 +103,14 @@ class Plausibility:
         self._rejections = Rejections()
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
-        #: Indices of the signals that are rejected together, by row of a joint or an IMU in the process image.
+        #: For each row of a joint or an IMU in the process image: indices of the signals that are rejected together.
         self._judged = {row: judged(codec, row) for row in (*self._joint_rows, *self._imu_rows)}
-        #: Indices of all signals of a joint, and index of the state of its drive, by row in the process image.
+        #: For each row of a joint in the process image: indices of all its signals, and index of its drive state.
         self._whole = {row: np.flatnonzero(codec.row_of == row) for row in self._joint_rows}
         self._drive_state = {row: codec.index(codec.messages[row].name, "DriveState") for row in self._joint_rows}
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
-        #: Cycle in which the last good values of each joint and IMU were measured, by row in the process image.
-        #: Not updated while `_settled` is True. In this time, the last good values of all rows are from the previous cycle.
+        #: For each row of a joint or an IMU in the process image: cycle in which its last good values were measured.
+        #: Not updated while `_settled` is True. Then the last good values of all rows are from the previous cycle.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
         #: Measured force of each faulty cell, by (foot, cell), shape (3,) [N]. In the process image, this force is set to 0.
         self._measured_forces: dict[tuple[int, int], Vector] = {}
@@ -206,7 +206,7 @@ class Plausibility:
 
     @property
     def swing(self) -> int | None:
-        """Return the index of the swing leg in FEET; None unless exactly one foot is on the ground."""
+        """Return the index of the swing leg in FEET if exactly one foot is on the ground, otherwise None."""
         return self._feet.swing
 
     @property
@@ -314,7 +314,7 @@ class Plausibility:
             self._force[cell] = 0.0
 
     def _restore_cells(self) -> None:
-        """Restore the measured forces of faulty cells, which the previous cycle has set to zero in the process image.
+        """Restore the measured forces of the faulty cells, because the previous cycle has set these forces to zero.
 
         The foot checks need the measured forces. A foot with new values already has its measured forces.
         """

@@ -17,9 +17,9 @@ Cycles = npt.NDArray[np.int64]
 
 #: Quantities of a joint or IMU message that are rejected together if one of them is implausible.
 #: Reason: checks and controllers need values that were measured at the same time.
-#: Joints: the limiter, the velocity check and the controllers need position and velocity of the same time.
+#: Joints: the limiter, the velocity check and the controllers need position and velocity that were measured at the same time.
 #: IMUs: the inertial, trunk, knee and motion checks compare attitude, angular velocity and specific force with each other.
-#: All other signals of the frame are used. So the reaction to a failed or hot drive follows even if its encoder is wrong.
+#: All other signals of the frame are used. So a failed or hot drive causes its reaction even if its encoder is wrong.
 #: If a position is rejected, the torque of its frame is still used, because no check needs position and torque of the same cycle:
 #: - `Stillness` uses the torque only in cycles in which the position was accepted.
 #: - `HoldStability` accepts a position that is up to four cycles older than the torque.
@@ -109,7 +109,7 @@ def signals_of(codec: Codec, values: Vector) -> Signals:
 
 
 def judged(codec: Codec, row: int) -> npt.NDArray[np.intp]:
-    """Return the indices in the decoded values of those signals of a message whose quantity is in `JUDGED`, shape (n,).
+    """Return the indices of the signals of a message that have a quantity in `JUDGED`, shape (n,).
 
     Args:
         codec: codec of the process image.

@@ -25,7 +25,7 @@ from atalante_hal.wire.process_image import NEVER
 #: Number of consecutive samples with a tilted sole after which an ankle encoder is reported. A foot is sampled every 32 cycles.
 #: The sole counts as tilted if the force cells show a flat foot, but ankle encoders and tibia IMU show a tilt.
 SOLE_SAMPLES = 4
-#: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free` (largest force of an unloaded cell).
+#: Load that a foot flat on the floor must exceed, as a multiple of `cell_free` (largest force of an unloaded cell).
 _LOAD = 4.0
 #: Largest distance of the centre of pressure from the middle of a flat foot: along the foot, across the foot.
 #: Each value is a multiple of the distance between the middle and a force cell in this direction.

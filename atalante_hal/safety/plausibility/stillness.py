@@ -38,23 +38,23 @@ from atalante_hal.safety.plausibility.signals import Cycles, Signals, measured
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: A stuck encoder is detected at most this time [cycles] after its first repeated reading.
+#: Longest time from the first repeated reading of a stuck encoder to its detection [cycles].
 STUCK_CYCLES = 50
-#: A frozen gyro or force cell is detected at most this time [cycles] after its first repeated reading.
+#: Longest time from the first repeated reading of a frozen gyro or force cell to its detection [cycles].
 FROZEN_CYCLES = 100
-#: If a shank turns by this angle [rad] above a loaded foot, the readings of the ankle encoders must change.
+#: Turn of a shank above a loaded foot after which the readings of the ankle encoders must have changed [rad].
 _TURN = 0.01
 #: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
-#: A joint counts as at rest after this number of cycles with a constant encoder reading.
-#: If the torques on the joint were not in balance, they would have moved the joint within `_AT_REST` cycles.
+#: Number of cycles with a constant encoder reading after which a joint counts as at rest.
+#: Torques that are not in balance would move the joint within `_AT_REST` cycles.
 _AT_REST = 3
-#: When a joint has turned by this angle [rad], its encoder reading must have changed. The angle is 20 encoder counts.
+#: Turn of a joint after which its encoder reading must have changed [rad]. The turn is 20 encoder counts.
 _DRIVEN = 1e-5
-#: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since then.
-#: If the last forces of a foot are older than `_FORCES_VALID`, the `Drive` records of its ankles are cleared.
+#: Largest age of the last forces of a foot at which they still show whether the foot is on the ground [cycles].
+#: If the forces are older, the foot may have left the ground or landed. Then the `Drive` records of its ankles are cleared.
 _FORCES_VALID = 5
-#: Number of repeated readings [samples] that is never reached: the limit for signals that may stay constant.
+#: Limit of the number of repeated readings for signals that may stay constant [samples]. No signal reaches this limit.
 _NO_LIMIT = 1 << 30
 #: Index of each ankle joint in JOINTS.
 _ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
@@ -111,8 +111,8 @@ class Stillness:
         where = measured(codec)
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
-        #: Present age of the values in the last sample [cycles], by row in the process image. It grows with each call.
-        #: If the age of the message (`_age`) is lower, newer values have arrived since the last sample.
+        #: Age of the values that were sampled last [cycles], by row in the process image. Each call of `sample` updates it.
+        #: If the message has a lower age (`_age`), newer values have arrived since the last sample.
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
@@ -136,7 +136,7 @@ class Stillness:
         self._gyro, self._force = codec.slice("Gyro"), codec.slice("Force")
         self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
         self._breakaway = robot.breakaway
-        self._loaded = 2.0 * robot.sensors.cell_free  # a foot with more than this vertical force [N] is on the ground
+        self._loaded = 2.0 * robot.sensors.cell_free  # vertical force above which a foot is on the ground [N]
         self._interval = every * period
         self._drive = Drive(*np.zeros((6, len(JOINTS))))
         #: Indices of the joints whose encoder reading is constant despite a large torque, see *Large torque* above.

@@ -24,20 +24,23 @@ from atalante_hal.robot import FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.signals import Ages, Signals
 
-#: A foot is reported if, for this time [cycles], it alone carries load and is more than `_HEIGHT` above the other foot.
+#: Duration of a contradiction after which a foot is reported [cycles].
+#: Contradiction: the foot alone carries load, but it is more than `_HEIGHT` above the other foot.
 HEIGHT_CYCLES = 64
-#: The feet are reported as exchanged if, for this time [cycles], the robot leans away from the leg with clearly more load.
+#: Duration of a contradiction after which the feet are reported as exchanged [cycles].
+#: Contradiction: the robot leans away from the leg with clearly more load.
 WEIGHT_CYCLES = 128
 #: Mean length of a thigh or a shank [m]. The real lengths are adjusted to the patient.
 SEGMENT = 0.4
 #: Lateral distance of the ankles while both legs are parallel [m].
 ANKLE_DISTANCE = 0.188
-#: A foot cannot carry load if it is above the other foot by more than this height [m].
+#: Largest height above the other foot at which a foot can carry the load alone [m].
 #: In walks of eight patients, a loaded foot is at most 0.01 m above the other foot, a swinging foot up to 0.09 m.
 _HEIGHT = 0.04
-#: If the robot leans to one side by more than this angle [rad], the load must be on the leg of this side.
+#: Largest lean to one side at which the load may be on either leg [rad].
+#: At a larger lean, the load must not be clearly on the leg of the opposite side.
 _LEAN = 0.05
-#: The load is clearly on one leg if the difference of both loads is above this share of their sum.
+#: Difference of the two loads, as a share of their sum, above which the load is clearly on one leg.
 _SHARE = 0.3
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = [IMUS.index(f"{side}_tibia") for side in SIDES]
@@ -63,8 +66,7 @@ class Support:
     def __init__(self, robot: Robot, now: Signals, every: int) -> None:
         self._now, self._every, self._free = now, every, robot.sensors.cell_free
         self._to_joint = (robot.polarity / robot.gear)[_KNEES].tolist()
-        #: Time [cycles] for which one foot alone has reported load while it was more than `_HEIGHT` above the other foot.
-        #: One element for each foot.
+        #: For each foot: time [cycles] for which it alone has reported load while more than `_HEIGHT` above the other foot.
         self._too_high = [0 for _ in FEET]
         self._wrong_leg = 0  # time for which the robot has leaned away from the leg with clearly more load [cycles]
         self._found: tuple[Finding, ...] = ()
@@ -137,7 +139,7 @@ def posture_of(pelvis: Sequence[float], tibiae: Sequence[Sequence[float]], knees
 
 
 def on_wrong_leg(lean: float, left: float, right: float) -> bool:
-    """Return whether the load is clearly on the leg from which the robot leans away.
+    """Return whether the robot leans away from the leg with clearly more load.
 
     Args:
         lean: lean of the robot to the left [rad].

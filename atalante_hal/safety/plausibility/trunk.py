@@ -36,7 +36,7 @@ _FILTER_TIME = 0.1
 _MEAN_TIME = 0.25
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 0.3
-#: The check decides only while the filtered angular velocity of the trunk exceeds this value [rad/s rms].
+#: Filtered angular velocity of the trunk above which the check decides [rad/s rms].
 #: At rest, the noise of the gyroscopes is up to 0.004 rad/s rms.
 _LEAST_RATE = 0.008
 #: The IMUs count as exchanged if the height of the torso IMU, computed from the motion, is less than -`_SHARE` * `TORSO_HEIGHT`.
@@ -59,7 +59,7 @@ class Filters(NamedTuple):
     speed: Vector  # (2,) decaying integral of torso acceleration minus pelvis acceleration, time constant `_FILTER_TIME` [m/s]
     slow_speed: Vector  # (2,) low-pass of `speed` [m/s]
     slow_rate: Vector  # (2,) low-pass of the rate [rad/s]
-    slower_rate: Vector  # (2,) low-pass of the remaining rate, which is rate - `slow_rate` [rad/s]
+    slower_rate: Vector  # (2,) low-pass of (rate - `slow_rate`) [rad/s]
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
     #: (2,) running means. Element 0: filtered speed * filtered rate, the sum over both axes [m/s2].
     #: Element 1: square of the filtered rate, the sum over both axes [rad2/s2].
