@@ -23,7 +23,7 @@ from atalante_hal.wire.process_image import ReceiveImage
 
 #: Largest number of frames that are received in one cycle. In each cycle, the nodes send about 20 cyclic frames.
 RECEIVE_BUDGET = 128
-#: A fault is confirmed after this number of cycles in a row with too many received frames, or with a full transmit queue.
+#: Number of consecutive cycles with too many received frames, or with a full transmit queue, that confirm the fault.
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
@@ -302,7 +302,10 @@ class Transceiver:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
 
     def _log(self, first: int, count: int) -> None:
-        """Pass the frames `scratch[first:count]` to the tap. The next `bus.receive` overwrites their times in `bus.stamps`."""
+        """Pass the frames `scratch[first:count]` to the tap. Call this before the next `bus.receive`.
+
+        The next `bus.receive` overwrites the times of the frames in `bus.stamps`.
+        """
         if self.tap is not None and count > first:
             self.tap.received(self.scratch[first:] if first else self.scratch, count - first)
 

@@ -79,13 +79,13 @@ class State:
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
     #: Indices in `robot.IMUS` of the IMUs whose readings contradict gravity or their own attitude (`IMU_IMPLAUSIBLE`).
-    #: If torso IMU and pelvis IMU only contradict each other, neither of them is in the set.
+    #: If the only contradiction is between the torso IMU and the pelvis IMU, neither of them is in the set.
     implausible_imus: frozenset[int] = frozenset()
     #: (12,) Nm, last output of the torque limiter; None if unknown. Drives that follow the controller receive these torques.
     #: Drives that hold their positions receive the torque 0, not the output of the limiter.
     torque_sent: Vector | None = None
-    #: Number of cycles by which torques act late; 0 if every torque acts after the normal delay (`safety.direction.LATENCY`).
-    #: The direction test of the motors at START measures this delay of the torques, see `safety.direction`.
+    #: Delay of the torques beyond the normal delay `safety.direction.LATENCY` [cycles].
+    #: The direction test of the motors at START measures the delay, see `safety.direction`.
     delay: int = 0
 
 
@@ -99,20 +99,21 @@ class Command:
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
     step: int | None = None  # number of the walking step; None while the controller does not walk
-    walking: bool = False  # True while the robot walks on the ground; STOP then ends the walk before HOLD
+    #: True while the robot walks on the ground. In this case, STOP first ends the walk, and then HOLD follows.
+    walking: bool = False
     #: True if h < 0: a joint is outside the virtual guide, or a prediction exceeds the guide, a torque limit or a speed limit.
     #: The HAL reports GUIDE_OUTSIDE. This diagnostic is pending (the robot does not react) unless `guide_left` is True.
     outside: bool = False
     #: True if `outside` was True in too many cycles, although the guide is certified (calculated to keep the joints inside).
     #: While `outside` and `guide_left` are True, GUIDE_OUTSIDE is confirmed, and the state FULL_ASSIST follows.
     guide_left: bool = False
-    #: True if a step starts with a larger deviation than the certificate of the guide was calculated for.
+    #: True if a step starts with a deviation that exceeds the range for which the certificate of the guide was calculated.
     #: Four quantities at the start of the step are checked: angle deviation, speed deviation, acceleration and torque jump.
     #: If `hand_over_exceeded` is True, the HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not react to it.
     hand_over_exceeded: bool = False
-    #: True in the cycle in which a step starts without a guide, or in which its guide ends early. The cause is a delay of the
-    #: loop for which the guides are not designed. The HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not
-    #: react to it.
+    #: True in the cycle in which a step starts without a guide, or in which the guide of a step ends early.
+    #: The cause is a delay of the loop for which the guides are not designed.
+    #: The HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not react to it.
     loop_late: bool = False
 
 

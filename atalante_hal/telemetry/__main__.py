@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _INSTALL = "install it with `pip install 'atalante-hal[telemetry]'`"
 
 
-#: Time limit for closing the Zenoh session [s]. After this time SIGALRM ends the process; its files are already closed.
+#: Time limit for closing the Zenoh session [s]. Then SIGALRM ends the process. Its files are already closed.
 _SESSION_END = 1.0
 
 
@@ -102,7 +102,7 @@ class Outlets:
         return self.publisher.endpoint if self.publisher is not None else None
 
     def sinks(self, config: TelemetryConfig) -> list[tuple[MessageSink, int]]:
-        """Return the open recorder and publisher, each with its message period [cycles].
+        """Return each open sink (recorder, publisher) with its message period [cycles].
 
         Args:
             config: Telemetry configuration with the rates.

@@ -86,7 +86,7 @@ class Access:
         raise AccessError(f"listen must be {valid}, got {listen!r}")
 
     def user_lines(self) -> list[str]:
-        """Return the lines name:password of the file of users, without comments and without spaces at the ends of a line."""
+        """Return the lines `name:password` of the file `users`. Comments, and spaces at both ends of a line, are removed."""
         lines = self.users.read_text(encoding="utf-8").splitlines() if self.users is not None else []
         return [line for line in map(str.strip, lines) if not line.startswith("#")]
 

@@ -51,7 +51,7 @@ def check_format(path: Path) -> str:
 
 
 class CanLog(Closing):
-    """Writer of a CAN log file. The file is locked until it is closed, so that no second run writes it.
+    """Writer of a CAN log file. The file is locked until it is closed, so that a second run cannot write to it.
 
     Args:
         path: Path of the file; missing folders are created.

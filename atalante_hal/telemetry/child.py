@@ -78,7 +78,7 @@ class TelemetryChild(Closing):
         return self._process.poll() is None
 
     def report(self, timeout: float) -> dict[str, Any] | None:
-        """Return the next JSON line of the subprocess. Return None if it has ended or prints no line in time.
+        """Return the next JSON line of the subprocess. Return None if the subprocess has ended or prints no line in time.
 
         Args:
             timeout: Longest wait [s].

@@ -38,18 +38,20 @@ CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
 RUN_GAP_NS = 1_000_000_000
 
 
-#: If the subprocess reads no record for this time [s] although a ring contains records, it is regarded as hung.
+#: Longest time in which the subprocess may read no record although a ring contains records [s].
+#: After this time, the subprocess counts as hung.
 HANGS_AFTER = 2.0
 #: Largest number of restarts in a session.
 RESTARTS = 3
 #: Time between two attempts of `close` to kill a subprocess that is still starting [s].
 _KILLED = 0.1
-#: After its summary, the subprocess has this time [s] to end its Zenoh session. Then `close` kills the subprocess.
+#: Longest time from the summary of the subprocess to the end of its Zenoh session [s]. Then `close` kills the subprocess.
 _SESSION_END = 2.0
-#: A restarted subprocess that is not ready after this time [s] is ended. Then `tend` restarts the subprocess again.
+#: Time limit for the start of a restarted subprocess [s].
+#: A subprocess that is not ready in time is ended. Then `tend` restarts the subprocess again.
 _RESTART = 30.0
 #: Time limit for the start of the first subprocess on the wall clock [s].
-#: A subprocess that is not ready after this time is ended. Then `tend` starts a new subprocess.
+#: A subprocess that is not ready in time is ended. Then `tend` starts a new subprocess.
 #: A run may begin before the subprocess is ready, see `TelemetryProcess.start`.
 _JOIN = 60.0
 
@@ -76,9 +78,9 @@ class TelemetryConfig:
     can_log: Path | None = None  # log file of all CAN frames; the file suffix determines the format; None for no log
     lock_step: bool = False  # True in virtual time (lock-step): the loop waits if recorder or CAN log are too slow
     #: Number of slots of the ring of cycle records: at one record per cycle, 1024 slots store the last 1023 cycles.
-    #: The ring of CAN frames has the same number of slots. Each of its records contains the frames of two or three cycles.
+    #: The ring of CAN frames has the same number of slots. Each frame record contains the frames of two or three cycles.
     slots: int = 1024
-    patience: float = 5.0  # s, longest wait of the loop for the recorder or the CAN log in lock-step
+    patience: float = 5.0  # longest wait of the loop for the recorder or the CAN log in lock-step [s]
     certificate: Path | None = None  # TLS certificate, see `access.Access`
     private_key: Path | None = None  # private key of the TLS certificate, see `access.Access`
     client_ca: Path | None = None  # authority that signs the subscriber certificates, see `access.Access`
@@ -108,7 +110,7 @@ class TelemetryConfig:
 
     @property
     def requires_publisher(self) -> bool:
-        """Return whether the session must have a publisher: publishing with an endpoint, TLS or users was requested."""
+        """Return whether publishing was requested with an endpoint, TLS or users, so that the session must have a publisher."""
         return self.publish and (self.listen is not None or self.access != Access())
 
     def to_json(self) -> dict[str, Any]:
@@ -201,7 +203,8 @@ class TelemetryProcess(Closing):
         self._recordings: list[str] = []  # names of the recording files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened
         self._restarting: threading.Thread | None = None  # thread that starts or restarts the subprocess
-        self._progress = (0, 0.0)  # number of records read so far, and time of the last change of this number [s]
+        #: Number of records read or lost so far, and last time at which this number had changed or no record waited [s].
+        self._progress = (0, 0.0)
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),

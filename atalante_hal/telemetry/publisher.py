@@ -28,7 +28,7 @@ from atalante_hal.telemetry.schema import encoding
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 7447
-#: If no endpoint is configured, this number of ports is tried. So several demos can run on one machine.
+#: Number of ports that are tried if no endpoint is configured. So several demos can run on one machine.
 PORTS_TRIED = 16
 #: Number of events cached for late subscribers.
 EVENTS_KEPT = 256

@@ -48,7 +48,7 @@ _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader
 #: Number of attempts to lock a byte. An attempt may fail, because `_held` in the other process locks the byte for microseconds.
 _LOCK_TRIES = 50
 
-_WAIT = 0.0002  # s, polling period
+_WAIT = 0.0002  # polling period [s]
 NOTES_BYTES = 1 << 16
 
 

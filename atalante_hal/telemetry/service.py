@@ -28,9 +28,9 @@ if TYPE_CHECKING:  # only for type checks, because protobuf and mcap are optiona
     from atalante_hal.telemetry.messages import Encoder
     from atalante_hal.telemetry.recorder import Recorder
 
-_POLL = 0.005  # s, polling period of empty rings
-_WRITER_CHECK = 0.2  # s, shortest time between two checks whether the writer's process exists
-_DROPPED_EVERY = 1.0  # s, shortest time between two reports of lost cycles
+_POLL = 0.005  # polling period of empty rings [s]
+_WRITER_CHECK = 0.2  # shortest time between two checks whether the writer's process exists [s]
+_DROPPED_EVERY = 1.0  # shortest time between two reports of lost cycles [s]
 #: Largest number of records in one batch. 64 records of the frame ring contain the frames of about 128 cycles.
 #: The counter of the read records changes once per batch. A change shows the control loop that this process does not hang.
 #: A writer that waits for a free slot of the ring continues when the counter of the read records changes.
@@ -47,7 +47,7 @@ class Run:
 
     number: int
     name: str
-    #: Log time of cycle 0 of the run [ns]. Only in lock-step, the log times of records and events are computed from it.
+    #: Log time of cycle 0 of the run [ns]. In lock-step, the log times of records and events are computed from it.
     #: In real time, the log time is the time of day at which a record or an event was written.
     start_ns: int
     first: int  # number of the first record of the run
@@ -85,7 +85,7 @@ class Service:
         self._runs = [Run(0, "", records.meta["start_ns"], 0)]
         self._cycle, self._timestamp = 0, self._runs[0].start_ns  # cycle number and log time [ns] of the last record
         self._lost, self._lost_reported = 0, -math.inf
-        self._recorder, self._saved = recorder, 0  # `_saved`: last seen value of `recorder.saved` (messages on disk)
+        self._recorder, self._saved = recorder, 0  # `_saved`: last `recorder.saved`, the number of messages on disk
         self._handled = 0  # number of records whose messages have been passed to all sinks
         self._kept = 0  # number of saved records that this service has reported by `RingReader.keep`
         self.notices: list[str] = []  # faults, one sentence each

@@ -32,9 +32,9 @@ BASE, FACTOR, OFFSET = range(3)
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range.
 # OUTSIDE: a signal is out of range, and no signal is marked as invalid.
-# MARKED_INVALID: a signal is out of range, and the same or another signal has its invalid code.
+# MARKED_INVALID: a signal is out of range, and at least one signal has its invalid code.
 INSIDE, OUTSIDE, MARKED_INVALID = range(3)
-#: Adding and then subtracting this number rounds a float64 to an integer of at most 51 bits (`LONGEST_SIGNAL`).
+#: Number that rounds a float64 to an integer of at most 51 bits (`LONGEST_SIGNAL`) when it is added and then subtracted.
 _ROUND = 1.5 * 2.0**52
 
 
@@ -50,7 +50,7 @@ class SignalTable(NamedTuple):
     codes: Words  # (size,) raw codes of the last decoding or encoding
     words: Words  # (n,) indices of all 64-bit words of the frame array that contain a signal
     by_row: Words  # (size,) indices of all signals, sorted by the row of the frame that contains the signal
-    row_begins: Words  # (rows + 1,) the signals of row r are by_row[row_begins[r] : row_begins[r + 1]]
+    row_begins: Words  # (rows + 1,) begins of the rows in `by_row`: row r is by_row[row_begins[r] : row_begins[r + 1]]
 
 
 @lru_cache(maxsize=4096)

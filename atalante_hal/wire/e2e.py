@@ -26,7 +26,7 @@ CRC_START = 0xFFFF
 CRC_BYTES = 2
 #: Offset of the alive counter in the payload [bytes].
 COUNTER_BYTE = 2
-#: Largest increase of the counter that is accepted as new data: up to four frames in a row may be lost.
+#: Largest increase of the alive counter at which a frame counts as new data. So up to four frames in a row may be lost.
 MAX_DELTA = 5
 
 
@@ -177,12 +177,12 @@ def check_counter(last: int | None, received: int) -> Check:
 BAD_CYCLE = 4
 #: Decrease of the error counter in a good cycle. The counter rises on average if more than a fifth of the frames are lost.
 GOOD_CYCLE = 1
-#: Limit of the error counter. At this value the message is no longer trusted.
+#: Limit of the error counter. When the error counter reaches the limit, the message is no longer trusted.
 FULL = 64
-#: A message is trusted after this number of good cycles in a row.
+#: Number of consecutive good cycles after which a message is trusted.
 #: The values of a message that is not trusted are not used. For example, the inputs of the pendant are ignored.
 REQUALIFY = 16
-#: `suspect` increases its counter by this value in each cycle in which a message has frames of two senders.
+#: Increase of the counter of `suspect` in each cycle in which a message has frames of two senders.
 #: After 64 / 16 = 4 consecutive cycles with frames of two senders, the counter reaches `FULL`. Then two senders are confirmed.
 RIVAL_CYCLE = 16
 

@@ -77,7 +77,7 @@ _OUT_OF_RANGE = frozenset({Check.RANGE, Check.INVALID})
 _FOREIGN = -1
 #: Age of a message that has never been received [cycles].
 NEVER = 1 << 30
-#: An answer to a SYNC is rejected as a replayed frame if the SYNC was sent this number of cycles ago or earlier.
+#: Smallest age, counted from its SYNC, at which an answer is rejected as a replayed frame [cycles].
 _TOO_OLD = 16
 #: Half the period of the 8-bit alive counter. A frame is old if (its counter - last accepted counter) mod 256 is at least 128.
 #: Example: (250 - 5) mod 256 is 245, so counter 250 is older than 5. After 128 cycles without a frame, this comparison may err.
@@ -147,7 +147,7 @@ class ReceiveImage:
         #: Row and `Check` of each frame that was rejected in this cycle.
         #: If the argument `restarts` is True, the list also contains the committed frames with the check result CONFLICT.
         self.refused: list[tuple[int, Check]] = []
-        #: Row of each frame of this cycle in which the sender set the flag ESI (error passive). Damaged frames are included.
+        #: Row of each frame with the flag ESI (its sender is error passive) in this cycle. Damaged frames are included.
         self.error_passive: list[int] = []
         self._restarts = restarts
         is_independent = np.array([group_of(signal.name) in independent for _, signal in self.codec.signals])
@@ -324,7 +324,8 @@ class ReceiveImage:
         )
         self._offered = frames, found
         foreign = []
-        outside: dict[int, int] = {}  # row -> index of its last frame that was rejected only for a value out of range
+        #: For each row: index of its last frame that was rejected only because a value is out of range.
+        outside: dict[int, int] = {}
         for index, (row, check, passive) in enumerate(found.tolist()):
             if row == _FOREIGN:
                 foreign.append(index)
@@ -355,7 +356,7 @@ class ReceiveImage:
         self.values[inside] = values[inside]
 
     def decode_further_frames(self, row: int) -> list[Vector]:
-        """Decode the intact frames of one message that arrived in this cycle but are not stored in `values`.
+        """Decode those intact frames of a message in this cycle that are not stored in `values`.
 
         Repetitions of an accepted frame are left out. Call this method before the receive buffer is used again.
 
@@ -628,7 +629,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # `specialised` runs `seal` once with the counter 0xFF. The next counter is 0. The first sent frame has this counter.
+        # `specialised` runs `seal` once with the counter 0xFF. So the first frame that is sent has the counter 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 
@@ -678,7 +679,7 @@ class TransmitImage:
         return self.frames
 
     def seal_row(self, row: int) -> Frames:
-        """Return the frame of one row for sending, with the last counter of the row plus 1.
+        """Return the frame of one row to send. The counter of the frame is the last counter of the row plus 1.
 
         The counters of the other rows do not change.
 
