@@ -486,7 +486,7 @@ class SafetyMonitor:
         self._stalled = 0
         if not self._proof_begun:
             # The direction test starts from the torques that the HAL sent last (`limiter.last`).
-            # While `enabling` is True, they follow the torques that the drives report. So wait until `enabling` is True.
+            # While `enabling` is True, the sent torques follow the reported torques. So wait until `enabling` is True.
             if not self.enabling:
                 return None
             self._proof_begun = True

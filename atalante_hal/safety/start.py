@@ -21,7 +21,7 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
 
-#: Time limit of a start [cycles]. In READY and HOLD, all drives must be enabled and the direction test must end before the limit.
+#: Time limit of a start [cycles]. In READY and HOLD, the limit covers the enabling of all drives and the direction test.
 ENABLE_CYCLES = 200
 #: Time without a state change of any drive after which a start in READY or HOLD ends [cycles].
 #: Even if four consecutive commands and then four consecutive answers of a drive are lost, the start does not end.
