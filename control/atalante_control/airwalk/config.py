@@ -19,7 +19,7 @@ class AirwalkConfig(StepGuideConfig):
     """
 
     #: Whether the control law of the paper is used: assistive torque of `guide.literal`, baseline without gravity torque.
-    #: If true, it is not proven that the joints stay inside the guide when a disturbance torque acts.
+    #: With the control law of the paper, there is no proof that the joints stay inside the guide under disturbance torques.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
     #: fraction of the step duration after which the desired trajectory is the nominal trajectory again, see `gait.recentering`
@@ -29,7 +29,7 @@ class AirwalkConfig(StepGuideConfig):
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait
     #: s, fade-out time of the torque that prevents a jump at a stance change (`carry_over`); with 0, the torque can jump
     blend: float = 0.02
-    #: s, fade-out time as `blend`, but for sagittal hip and knee of a leg with a guide.
+    #: s, fade-out time of the same torque at sagittal hip and knee of a leg with a guide; `blend` applies to all other joints.
     #: The certificate of the guide assumes the fade-out time `guided_blend`.
     guided_blend: float = 0.006
 

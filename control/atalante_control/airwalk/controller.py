@@ -183,7 +183,7 @@ class AirwalkController:
             self._guides.prepare()
 
     def choice(self, xi: float) -> Choice:
-        """Return the guide filter for an assistance factor, and the fraction of the requested torques for which it is certified.
+        """Return the guide filter for an assistance factor, and the certified torques as a fraction of the requested torques.
 
         The requested disturbance torques are `config.promise`. The literal law is certified for no torques (fraction 0).
 
@@ -194,14 +194,14 @@ class AirwalkController:
 
     @property
     def guided_blend(self) -> Vector:
-        """Return the fade-out factors of the carry-over of joints with a guide, shape (n,).
+        """Return the fade-out factors of the carry-over torque for joints with a guide, shape (n,).
 
         Element i is the fraction of the carry-over torque that is still added in cycle i after the stance change.
         """
         return self._carry.guided_blend
 
     def certificate(self, xi: float) -> Certificate:
-        """Return the certificate of the guide used at an assistance factor, see `StepGuides.certificate`.
+        """Return the certificate of the guide that is used at an assistance factor, see `StepGuides.certificate`.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -310,7 +310,7 @@ class AirwalkController:
         if xi < 1.0 and self._loop_delay.confirmed:
             self._command.loop_late, xi = True, 1.0
             self.statistics.late += 1
-        else:  # Count only factors set by the operator, not the factor 1 that the controller sets if the loop is late.
+        else:  # Record only factors that the operator sets. If the loop is late, the controller sets the factor 1.
             self.statistics.factors.add(xi)
         self._assisting = xi < 1.0
         leg = _LEG * (1 - stance)
@@ -345,7 +345,7 @@ class AirwalkController:
         self._start, self._promised = (angles, rates), promise > 0.0
 
     def _check_hand_over(self) -> bool:
-        """Return whether a step starts with larger deviations than its guide is certified for, and count the step.
+        """Count a step, and return whether the step starts outside the hand-over box of the guide certificate.
 
         The guide is certified for deviations inside the hand-over box (`HandOver`). Only steps with a certified guide are checked
         and counted, and only after the end of the first right-stance step. The torque jump is known after the first cycle of the

@@ -47,7 +47,7 @@ class Parts(NamedTuple):
     #: With c0 and c1, the ankle deviations at the stance change fade out, see `LevelFeet.cubics`.
     cubics: Vector
     literal: LiteralTables  # tables of the control law as printed in the paper, see `LiteralGuide.tables`
-    carries: Records[Carry]  # (1,) torque before and torque added after a stance change, see `CarryOver.records`
+    carries: Records[Carry]  # (1,) state of the carry-over, see `CarryOver.records`
     #: (2, n) column i: fractions of `Carry.carried` that are added in cycle i after a stance change, see `CarryOver.blends`.
     blends: Vector
     outputs: Records[Outputs]  # (1,) results of the cycle
@@ -86,7 +86,7 @@ def run(
     leg = swing * len(LEG_JOINTS)
     hip, knee = leg + _SH, leg + _SK
 
-    # For `desired[:] = row`, numba would create an array, because source and target could overlap.
+    # Element by element: numba would allocate a temporary array for `desired[:] = row`, because the arrays could overlap.
     for k in range(len(desired)):
         desired[k] = row[k]
     if level:

@@ -23,7 +23,8 @@ class Telemetry:
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad, desired joint angles
     error: Annotated[Vector, 2]  # rad, q - q_des
-    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound: upper bound if error > 0, else lower
+    #: Distance from q_des to a guide bound [rad]: to the upper bound if error > 0, else to the lower bound.
+    q_bound: Annotated[Vector, 2]
     guide: Annotated[Vector, 2]  # rad, distances from q_des to upper and lower guide bound of the hip
     #: safety value h of the guide filter, equal for hip and knee.
     #: If h >= 0, the backup policy can keep both joints inside the guide.
@@ -37,7 +38,7 @@ class Telemetry:
 
 
 _DTYPE = dtype_of(Telemetry)
-#: Name and number of values of each published field, in the order of the record.
+#: Published fields in the order of the record. Each element: name of the field, and number of values in the field.
 TELEMETRY_FIELDS = tuple(
     ({"gate": "lambda"}.get(name, name), _DTYPE[name].itemsize // 8) for name in _DTYPE.names or ()
 )

@@ -36,11 +36,11 @@ LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: rad, a network file is rejected if a joint angle jumps by more than this value at the stance change (rounding tolerance).
-#: The check computes this jump for the bias and for each weight row of the last layer, as if they were control points of a gait.
+#: Largest accepted jump of a joint angle at the stance change [rad], as a tolerance for rounding errors.
+#: The check treats the bias and each weight row of the last layer as control points of a gait, and computes each jump.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
-#: An input may be beyond its range by this fraction of the bound, because the ratios `thigh` and `shank` have rounding errors.
+#: Relative tolerance for inputs beyond a bound of their range. Reason: the ratios `thigh` and `shank` have rounding errors.
 _ROUNDING = 1e-9
 
 
@@ -57,7 +57,7 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class GaitNetwork:
-    """Gait network: weights of the layers, and range of the inputs for which the weights were fitted."""
+    """Gait network: weights of the layers, and input range for which the network was fitted."""
 
     low: Vector  # smallest valid values of INPUTS, shape (6,)
     high: Vector  # largest valid values of INPUTS, shape (6,)

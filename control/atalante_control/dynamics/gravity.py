@@ -58,8 +58,8 @@ class Gravity:
             articulated: model of the empty exoskeleton with the pelvis fixed.
         """
         self.links, self._torque = _links(articulated), np.zeros(len(JOINTS))
-        # Writable copy of the joint angles. For numba, a read-only array has another type.
-        # With a read-only array, numba would compile `hold` again, in the control loop.
+        # Writable copy of the joint angles. For numba, read-only arrays and writable arrays have different types.
+        # If `hold` got a read-only array in the control loop, numba would compile `hold` again.
         self._position = np.zeros(len(JOINTS))
         self._hold = compiled(hold)
         self.torque(np.zeros(len(JOINTS)), (1.0, 0.0, 0.0, 0.0))

@@ -34,11 +34,12 @@ from atalante_hal.types import Vector
 
 HIDDEN = (64, 64)
 ITERATIONS = 1500  # largest number of L-BFGS iterations
-#: rad, the fit uses the smallest number of principal directions for which the rms error is at most this value
+#: Largest accepted rms error due to omitted principal directions [rad]. The fit uses as few directions as possible.
 RESOLUTION = math.radians(0.003)
-JUMP_KEPT = 0.4  # before the fit, the speed jump of each gait at the stance change is reduced to this fraction
+JUMP_KEPT = 0.4  # fraction to which the speed jump of each gait at the stance change is reduced before the fit
 END_WEIGHT = 40.0  # weight of the squared angle errors at start and end of a step; the weight is 1 at the other samples
-ACCELERATION_WEIGHT = 5e-2  # s2, an acceleration error of 1 rad/s2 counts as much as an angle error of 0.05 rad
+#: Weight of acceleration errors [s2]: an acceleration error of 1 rad/s2 counts as much as an angle error of 0.05 rad.
+ACCELERATION_WEIGHT = 5e-2
 #: Rms length to which the target vectors of the training are scaled. Smaller targets give a smaller training loss.
 #: With smaller targets, L-BFGS would stop too early: it stops if an iteration reduces the loss by less than 2e-9.
 TARGET_SIZE = 10.0
@@ -48,7 +49,7 @@ _SAMPLES = 41  # number of samples per step in the comparison of two gaits
 
 
 class FitError(ValueError):
-    """Error of gaits to which no network can be fitted."""
+    """Gaits to which no network can be fitted. The message states the reason."""
 
 
 class Fit(NamedTuple):
@@ -129,7 +130,7 @@ def inputs(gait: Gait) -> Vector:
 
 
 def _metric(duration: float) -> Vector:
-    """Return the matrix M of the squared distance `d^T M d` of two gaits, shape (96, 96). d is the control point difference.
+    """Return the matrix M that defines the squared distance `d^T M d` between two gaits, shape (96, 96).
 
     d contains the control points of one gait minus those of the other gait. The squared distance is the weighted mean of squared
     errors along the step.

@@ -44,7 +44,7 @@ Solve = Callable[[Subject], SolvedGait]
 
 
 class LibraryError(ValueError):
-    """Error of a gait library that is missing, invalid or made for another grid. The message states the file or folder."""
+    """Missing or invalid gait library, or gait library for another grid. The message states the file or folder."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class Library:
         return gaits
 
     def rejected(self) -> dict[Index, str]:
-        """Return why gait files are rejected, for each grid point with a rejected file.
+        """Return the reason of the rejection for each grid point whose gait file is rejected.
 
         `generate` solves the gaits of these grid points again.
         """

@@ -21,11 +21,11 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: Part of dask's error message if the scheduler cannot load the calls. To load a call, the scheduler imports its function.
+#: Part of the error message of dask if the scheduler cannot load the calls, which requires an import of the called function.
 _FOREIGN: Final = "Error during deserialization of the task graph"
-#: Longest time in which the first worker must connect to the scheduler [s].
+#: Timeout of the connection of the first worker to the dask scheduler [s].
 _WORKER_TIMEOUT: Final = 10.0
-#: After this number of process crashes, the calls run one at a time. A crash then loses the result of one call only.
+#: Number of process crashes after which the calls run one at a time. A crash then loses the result of one call only.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
@@ -254,7 +254,7 @@ def _client(address: str) -> Iterator[Any]:
         raise FanOutError(
             f"no dask scheduler responds at {address} ({error}): start one with `dask scheduler`"
         ) from error
-    # The error of a lost connection is reported as one sentence. The client would also log its traceback.
+    # A lost connection is reported as one sentence. Without the change of the log level, the client would also log a traceback.
     logger = logging.getLogger("distributed.client")
     level = logger.level
     logger.setLevel(logging.CRITICAL)

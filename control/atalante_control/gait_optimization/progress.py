@@ -30,7 +30,7 @@ class Watch(casadi.Callback):
         self.construct("watch", {})
 
     def get_n_in(self) -> int:
-        """Return the number of inputs of the callback. The inputs are the outputs of the solver."""
+        """Return the number of inputs of the callback: one input for each output of the solver."""
         return int(casadi.nlpsol_n_out())
 
     def get_n_out(self) -> int:

@@ -19,9 +19,10 @@ class Requirements:
     speed_share: float = 0.9  # usable fraction of the speed limits of the joints
     friction: float = 0.5  # largest ratio of horizontal to vertical ground force
     force_min: float = 300.0  # N, smallest vertical ground force
-    sole_share: float = 0.6  # the centre of pressure must be inside this fraction of the sole
-    #: At each node, the centre of pressure must be inside this fraction of the rectangle between the force cells of the foot.
-    #: Between nodes, and in gaits interpolated by the gait network, the centre of pressure can be up to 3.2 mm outside this area.
+    sole_share: float = 0.6  # fraction of length and width of the sole in which the centre of pressure must stay
+    #: Fraction of length and width of the rectangle between the force cells of the foot.
+    #: At each node, the centre of pressure must be inside the reduced rectangle.
+    #: Between nodes, and in gaits from the gait network, the centre of pressure can be up to 3.2 mm outside.
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: m, smallest height of the swing sole at mid-swing.
@@ -45,6 +46,6 @@ class Requirements:
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
     # Weights of the cost. The sum of (joint torque / 100 Nm)^2 has weight 1.
     # With `tilt_weight` = 0 and `pressure_weight` = 0, similar subjects get very different swing motions.
-    acceleration_weight: float = 3e-3  # weight of the squared joint accelerations in rad/s2
-    tilt_weight: float = 5.0  # weight of the squared tilt of the swing sole in rad
+    acceleration_weight: float = 3e-3  # weight of the sum of (joint acceleration / 1 rad/s2)^2
+    tilt_weight: float = 5.0  # weight of sin(tilt of the swing sole)^2
     pressure_weight: float = 20.0  # weight of (horizontal ground moment about the sole centre / 1500 Nm)^2

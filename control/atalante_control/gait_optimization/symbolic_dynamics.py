@@ -25,7 +25,7 @@ Symbol = Any  # casadi.SX
 
 _LEFT, _RIGHT = SIDES
 STANCE_FOOT, SWING_FOOT = f"{_RIGHT}_{LEG_LINKS['HA']}", f"{_LEFT}_{LEG_LINKS['HA']}"
-_NUMBERS = 13  # number of parameters per body: mass, first moment (3), inertia about the origin (6), joint origin (3)
+_NUMBERS = 13  # parameters per body: mass (1), first moment (3), inertia about the origin (6), joint origin (3)
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Body:
     parent: str  # name of the parent link
     joint: int  # index of the joint in JOINTS; -1 for the pelvis, which has no joint
     origin: Vector3  # m, position of the joint in the frame of the parent link
-    yaw: float  # rad, rotation from parent frame to link frame about the z axis, at joint angle 0
+    yaw: float  # rad, angle of the link frame relative to the parent frame about the z axis, at joint angle 0
     axis: Vector3  # joint axis in the frame of the link
     mass: float  # kg, mass of the body
     moment: Vector3  # kg m, mass times position of the centre of mass
@@ -262,7 +262,7 @@ class Chain:
 
 
 def _carried(omega: Symbol, alpha: Symbol, lever: Symbol) -> Symbol:
-    """Return the acceleration of a point of a rotating body relative to the origin of the body.
+    """Return the acceleration of a point of a rotating body minus the acceleration of the origin of the body.
 
     Args:
         omega: angular velocity [rad/s].

@@ -46,7 +46,7 @@ class Tolerances(NamedTuple):
 
 #: Tolerances of a solved step, equal to the tolerances of the equality constraints of the optimiser.
 EXACT = Tolerances(1e-6, 1e-6, 1e-6, 1e-6)
-#: Tolerances of a step of the gait network. The network interpolates solved steps, so these conditions hold approximately.
+#: Tolerances of a step of the gait network. The network interpolates solved steps, so the conditions hold only approximately.
 INTERPOLATED = Tolerances(1e-3, math.radians(0.3), POSITION_JUMP, VELOCITY_JUMP)
 
 
@@ -310,7 +310,7 @@ class Verifier:
         return configuration, speed, jacobian
 
     def _forward(self) -> Vector:
-        """Return the rotation from the walking frame to the frame of the stance foot. Its angle is the toe-out."""
+        """Return the rotation from the walking frame to the frame of the stance foot. The rotation angle is the toe-out."""
         return np.asarray(pinocchio.utils.rotate("z", self._exo.toe_out))
 
     def _corners(self) -> Vector:
@@ -320,7 +320,7 @@ class Verifier:
         return np.array([(x + i * length / 2, j * width / 2, z) for i in (1, -1) for j in (1, -1)])
 
     def _foot_width(self) -> float:
-        """Return the lateral ankle distance below which the feet touch each other [m]. The toe-out moves the heels inwards."""
+        """Return the largest lateral ankle distance at which the feet touch [m]. The toe-out moves the heels inwards."""
         inner = self._forward().T @ (self._corners() * [1.0, -1.0, 1.0]).T
         return float(2.0 * inner[1].max())
 

@@ -127,8 +127,9 @@ class Responses(NamedTuple):
     error: Vector  # (n + 1, 2, 10) matrix from the state to the predicted error e [rad]
     rate: Vector  # (n + 1, 2, 10) matrix from the state to the predicted rate e' [rad/s]
     feedback: Vector  # (n + 1, 2, 10) matrix from the state to the predicted feedback -Kv e - Dv e' [rad/s2]
-    #: Responses to a disturbance acceleration of hip and knee in the first cycle, shape (n + 1, 2, 2).
-    #: Matrix k gives the response after k cycles for 1 rad/s2. The responses are e [rad], e' [rad/s] and -Kv e - Dv e' [rad/s2].
+    #: Responses to a disturbance acceleration of 1 rad/s2 during the first cycle, shape (n + 1, 2, 2).
+    #: Matrix k: response k cycles after the start. Row: responding joint. Column: disturbed joint (hip, knee).
+    #: Responses: error e [rad], rate e' [rad/s] and feedback -Kv e - Dv e' [rad/s2].
     pushed_error: Vector
     pushed_rate: Vector
     pushed_feedback: Vector
@@ -163,7 +164,9 @@ def responses(policy: BackupPolicy, loop: SampledLoop, mobility: float, cycles: 
 
 
 def _powers(a: Vector, b: Vector, outputs: Vector, cycles: int) -> tuple[Vector, Vector]:
-    """Return the free response C A^n and the impulse response C A^(n-1) b (0 at n = 0) for n from 0 to `cycles`.
+    """Return the free response C A^n and the impulse response C A^(n-1) b for n from 0 to `cycles`.
+
+    At n = 0, the impulse response is 0.
 
     Args:
         a: matrix A, shape (m, m).

@@ -58,7 +58,7 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")
-#: Smallest disturbance torque at the hip that is certified [Nm]. A guide that withstands less gets no certified torques.
+#: Smallest disturbance torque at the hip that is certified [Nm]. If the hip torque would be smaller, no torques are certified.
 SMALLEST = 1.0
 
 
@@ -76,7 +76,8 @@ class Limit(NamedTuple):
     The guide is certified for the requested disturbance torques of hip and knee, or for smaller torques in the same ratio.
     """
 
-    #: Largest allowed torques / requested torques; negative if the condition fails even without disturbance torques.
+    #: Ratio of the largest allowed disturbance torques to the requested disturbance torques.
+    #: The ratio is negative if the condition fails even without disturbance torques.
     #: Example: if 30 and 18 Nm are requested at hip and knee, a `scale` of 0.8 allows 24 and 14.4 Nm.
     scale: float
     what: str  # condition in words, for a message
@@ -92,7 +93,7 @@ class Certificate:
     reason: str  # sentence that states what limits the certified torques, or why there are none
     #: certified disturbance torques, which the running filter assumes; None if no torques are certified
     promise: JointTorque | None
-    #: Largest disturbance torques that meet all conditions with these gains. They are equal to `promise` or larger.
+    #: Largest disturbance torques that meet all conditions with the gains of the guide filter; at least as large as `promise`.
     #: None if no torques are certified.
     largest: JointTorque | None
     #: smallest fraction of the guide width that remains free under the certified torques; -inf if no torques are certified
@@ -237,12 +238,12 @@ class _Horizon:
         self.cycles, self._step = len(prediction.ahead) - 1, guide.cycles
         rows = prediction.ahead @ prediction.compress * SIZES
         beyond = prediction.beyond * SIZES
-        # Split the error one cycle after the prediction: factor * (error in the last predicted cycle) + remainder.
+        # Error in the cycle after the prediction: factor * (error in the last predicted cycle) + remainder.
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Data of three upper bounds of abs(remainder): the indices of two predicted cycles, and weights of shape (4, 2).
-        #: A bound is `errors @ weights`, for hip and knee. `errors` contains the absolute errors [rad] of hip and knee in the
-        #: first of the two predicted cycles, then those in the second.
+        #: Three upper bounds of abs(remainder). Each bound is described by two predicted cycles and by weights of shape (4, 2).
+        #: The bound for hip and knee is `errors @ weights`, shape (2,) [rad].
+        #: `errors` contains four absolute errors [rad]: hip and knee in the first cycle, then hip and knee in the second cycle.
         self._remainders: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -276,7 +277,7 @@ class _Horizon:
         """
 
         def parts(lag: int) -> tuple[Vector, Vector]:
-            """Return `free` and `used`: the allowed error and the error due to disturbances, `lag` cycles after the start.
+            """Return the arrays `free` and `used` for the cycle that is `lag` cycles after the start of a prediction.
 
             `free`: largest allowed error minus the tracking error that the model errors can cause.
             `used`: tracking error that the requested disturbance torques can cause.

@@ -32,9 +32,9 @@ class StepGuideConfig:
     torque_reserve: float = 14.0
     #: rad/s, smallest allowed distance of a predicted speed from the velocity limit of the robot
     speed_reserve: float = 0.2
-    #: s, gain zeta. If the safety value h is negative, a joint may leave the guide.
-    #: So the weight of the backup torque already rises while h falls, in proportion to zeta and -dh/dt.
-    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: Gain zeta [s]. While the safety value h falls, the weight w of the backup torque rises by (1 - w) * zeta * (-dh/dt).
+    #: Reason: the backup torque must act before h is negative, because a joint may leave the guide at a negative h.
+    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5. The weight is at most 1.
     zeta: float = 0.01
     #: Factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques.
     #: While the backup torque has the weight w, u_i is multiplied by `idealization` * (1 - w) + w.
@@ -42,7 +42,7 @@ class StepGuideConfig:
     #: Factor in [0, 1] on the feedforward torque u_f, which accelerates the leg along q_des.
     #: While the backup torque has the weight w, u_f is multiplied by `feedforward` * (1 - w) + w.
     feedforward: float = 1.0
-    #: If a counter exceeds this value, the controller reports that the leg has left its guide.
+    #: Value of a counter above which the controller reports that the leg has left its guide.
     #: The counter rises by 1 in each cycle in which the guide has certified torques and the safety value h is below 0.
     #: In every other cycle, the counter falls by 1, but not below 0.
     outside_cycles: int = 150

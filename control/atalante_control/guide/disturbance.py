@@ -32,9 +32,9 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Approximate maximum spacing of the grid of knee angles for which the mass matrix is evaluated in each cycle [rad].
-#: Near the start of a step, the spacing may be larger. The start deviation widens the range of the grid, and the number of
-#: knee angles in the grid stays the same.
+#: Largest spacing of the knee angles for which the mass matrix is computed in each cycle, without a start deviation [rad].
+#: A start deviation widens the range of the knee angles near the start of a step, but does not change their number.
+#: The spacing can therefore be larger near the start of a step.
 _SPACING = math.radians(7.5)
 
 
@@ -107,7 +107,7 @@ class HandOver:
         )
 
     def added(self, blend: Vector) -> Vector:
-        """Return the largest torque that the controller adds in each cycle after a stance change, shape (m, 2) [Nm].
+        """Return the largest carry-over torque for each cycle after a stance change, shape (m, 2) [Nm].
 
         Args:
             blend: fraction of the added torque that remains in each cycle since the stance change, shape (m,).
@@ -115,7 +115,7 @@ class HandOver:
         return np.outer(blend, np.minimum(self.carried, self.torque))
 
     def remaining(self, blend: Vector, decrease: Vector) -> Vector:
-        """Return how much of the torque jump at a stance change can remain in the command in each cycle, shape (n, 2) [Nm].
+        """Return the largest part of the torque jump that can remain in each cycle after a stance change, shape (n, 2) [Nm].
 
         The command contains the added torque. The limiter of the robot lets a larger jump decrease only slowly.
 
@@ -184,7 +184,7 @@ class Leg(NamedTuple):
         return np.asarray(coulomb * np.tanh(speed / self.friction.smoothing) + viscous * speed)
 
     def torque(self) -> Vector:
-        """Return gravity plus centrifugal, Coriolis and inertia torque along the nominal trajectory, shape (n, 2) [Nm]."""
+        """Return the sum of gravity, centrifugal, Coriolis and inertia torque along the nominal motion, shape (n, 2) [Nm]."""
         needed = np.einsum("nij,nj->ni", self.masses(self.q[:, 1]), self.qdd)
         return np.asarray(needed + self.velocity_torque() + self.gravity)
 
@@ -220,7 +220,7 @@ class Leg(NamedTuple):
         return total
 
 
-#: The bound of the friction error covers joint speeds up to the nominal speed plus this margin [rad/s].
+#: Speed margin [rad/s]. The bound of the friction error covers joint speeds up to the nominal speed plus the speed margin.
 _SPEED_MARGIN = 1.0
 
 
@@ -241,12 +241,12 @@ class Effect(NamedTuple):
     joint (hip, knee).
     """
 
-    #: (n, 2, 2) pushed[i]: effect, i cycles later, of a disturbance of 1 rad/s2 that lasts one cycle.
+    #: Shape (n, 2, 2). pushed[i]: effect i cycles after the start of a disturbance. The disturbance is 1 rad/s2 for one cycle.
     #: For an error or a speed, `pushed` contains the change of the error or of the speed.
     #: For a torque, `pushed` contains an acceleration, which the mass matrices `left` convert to the torque.
     #: For a torque change, `pushed` contains a change of the acceleration, which `left` converts to the torque change.
     pushed: Vector
-    #: (n, 2, 2) hidden[i]: effect of a wrong start velocity on the value that is predicted i cycles ahead.
+    #: Shape (n, 2, 2). hidden[i]: effect of a wrong start velocity on the value that is predicted i cycles ahead.
     #: The start velocity has the measurement error that a joint acceleration of 1 rad/s2 causes.
     #: An empty array of shape (0, 2, 2) means that the start velocity is assumed to be exact.
     hidden: Vector
@@ -297,7 +297,7 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
         reported = column < len(grid.lags) and grid.lags[column] == lag
         starts = min(grid.starts, count - lag) if reported else 0
         hides = reported and len(effect.hidden) > 0
-        for r in range(2):  # elementwise: numba needs several seconds more to compile `both[0] = ...`
+        for r in range(2):  # element by element, because `both[0] = ...` makes the compilation several seconds longer
             for c in range(2):
                 both[0, r, c] = effect.pushed[lag, r, c]
                 if hides:

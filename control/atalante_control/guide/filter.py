@@ -56,17 +56,17 @@ class GuideConfig:
     rate_limit: float  # Nm, largest allowed change of the backup torque within one cycle
     speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the inertia and delay of the model
     worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
-    #: s, gain zeta. If the safety value h is negative, a joint may leave the guide.
-    #: So the weight of the backup torque already rises while h falls, in proportion to zeta and -dh/dt.
-    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: Gain zeta [s]. While the safety value h falls, the weight w of the backup torque rises by (1 - w) * zeta * (-dh/dt).
+    #: Reason: the backup torque must act before h is negative, because a joint may leave the guide at a negative h.
+    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5. The weight is at most 1.
     zeta: float = 0.01
     #: s, time constant of the low-pass filter for dh/dt, the rate of change of the safety value h
     derivative_time: float = 0.005
     release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0
-    #: Factor on the torque u_i, in [0, 1]. u_i cancels friction, gravity, centrifugal and Coriolis torques (joint idealization).
+    #: Factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques.
     #: While the backup torque has the weight w, u_i is multiplied by `idealization` * (1 - w) + w.
     idealization: float = 1.0
-    #: Factor on the torque u_f, in [0, 1]. u_f accelerates the leg along q_des (feedforward).
+    #: Factor in [0, 1] on the torque u_f, which accelerates the leg along q_des (feedforward).
     #: While the backup torque has the weight w, u_f is multiplied by `feedforward` * (1 - w) + w.
     feedforward: float = 0.0
 
@@ -181,7 +181,7 @@ class GuideFilter:
         return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
     def uncertainty(self) -> Vector:
-        """Return how much `errors_ahead` can change if the inertia or the delay is wrong, shape (n, 2) [rad]."""
+        """Return the largest change of `errors_ahead` due to errors of inertia and delay, shape (n, 2) [rad]."""
         x = self.state
         size = np.abs(np.concatenate([x[:2], x[2:4] - x[4:6], x[4:]]))
         return np.repeat(self.prediction.slack @ size, SLACK_CYCLES, axis=0)[: len(self.prediction.ahead)]

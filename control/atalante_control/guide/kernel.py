@@ -20,12 +20,13 @@ from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
 
-#: A ratio x (torque / limit or speed / limit) is converted to 1 - STEEPNESS * (1 - x). Example: 0.9 becomes 0.6, 1 stays 1.
+#: Slope of the conversion of a torque ratio or speed ratio x (x = value / limit) to 1 - STEEPNESS * (1 - x).
+#: Example: the ratio 0.9 is converted to 0.6, and the ratio 1 to 1.
 #: Normal walking already uses most of the allowed torque and speed.
 #: Due to the conversion, torque and speed raise the weight of the backup torque only close to their limits.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, a short form of the state of the leg.
-#: The tracking errors are predicted from the compressed state, which is faster than from all 10 elements of the state.
+#: A prediction of the tracking errors from the compressed state is faster than a prediction from all 10 elements of the state.
 COMPRESSED = 5
 #: Number of consecutive predicted cycles in a `Block`.
 #: `Block.slack` bounds the effect of model errors in all cycles of the block.
@@ -38,16 +39,16 @@ class Guard:
     """Constants and state of the filter, and results of the last cycle."""
 
     #: Gains of the backup policy. Row 0: acceleration of the hip. Row 1: acceleration of the knee.
-    #: Columns 0 and 1: Kv, gains on the errors of hip and knee [1/s2]. Columns 2 and 3: Dv, on the error rates [1/s].
+    #: Columns 0 and 1: Kv, gains on the errors of hip and knee [1/s2]. Columns 2 and 3: Dv, gains on the error rates [1/s].
     gains: Annotated[Vector, (2, 4)]
     torque_limit: float  # Nm, largest allowed torque in the prediction
     speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the inertia and delay of the model
     worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
     tracking: float  # share of a commanded torque change that a motor reaches within one cycle
     keep: float  # weight of the old value in the low-pass of the measured velocity
-    #: s, gain zeta. If the safety value h is negative, a joint may leave the guide.
-    #: So the weight of the backup torque already rises while h falls, in proportion to zeta and -dh/dt.
-    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: Gain zeta [s]. While the safety value h falls, the weight w of the backup torque rises by (1 - w) * zeta * (-dh/dt).
+    #: Reason: the backup torque must act before h is negative, because a joint may leave the guide at a negative h.
+    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5. The weight is at most 1.
     zeta: float
     #: weight of the new value in the low-pass filter for `rate`, the rate of change of the safety value h
     smoothing: float
@@ -63,9 +64,9 @@ class Guard:
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors of hip and knee
     lag: Annotated[Vector, 2]  # rad/s, estimated error of the measured velocities of hip and knee: true minus measured
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: Absolute values of the elements of `state`, except elements 2 and 3.
-    #: The effect of model errors is proportional to the elements of `magnitude`.
-    #: Elements 2 and 3 of `magnitude` are abs(true error rate - measured error rate) of hip and knee [rad/s].
+    #: Magnitudes to which the effect of model errors is proportional.
+    #: Elements 2 and 3: abs(true error rate - measured error rate) of hip and knee [rad/s].
+    #: All other elements: absolute value of the same element of `state`.
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
@@ -81,7 +82,7 @@ class Guard:
 
 
 class Lag:
-    """Matrix that predicts the tracking errors a fixed number of cycles ahead: `GuideTables.lags[i]` predicts i cycles ahead.
+    """Prediction matrix for one number of cycles ahead: `GuideTables.lags[i]` predicts the tracking errors i cycles ahead.
 
     A record has arrays of fixed shape, so the compiled loops are fast.
     """
@@ -146,7 +147,9 @@ class GuideTables(NamedTuple):
     step: Vector
 
 
-INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance to the upper and lower bound of the hip, then of the knee [1/rad]
+#: Columns 0 to 3 of `step`: 1 / (distance from q_des to a bound) [1/rad].
+#: Order of the bounds: hip upper, hip lower, knee upper, knee lower.
+INVERSE = 0
 REFERENCE = 4  # columns 4 and 5 of `step`: acceleration of q_des at the time when a command takes effect [rad/s2]
 VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass of the drives [rad/s]
 BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
@@ -155,16 +158,17 @@ SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
 #: Column 15 of `step`: smallest allowed weight of the backup torque.
 #: The smallest allowed weight falls from 1 to 0 in the first cycles of a step, so a step starts with the full backup torque.
 FLOOR = 15
-#: Columns 16 to 19 of `step` [1/rad]: columns 0 to 3, maximum over this cycle and the next `TAIL_CYCLES` cycles.
-#: The maximum is multiplied by 1 + `TAIL_MARGIN`.
+#: Columns 16 to 19 of `step` [1/rad], computed from columns 0 to 3 in the same order.
+#: Row k: largest value of the column in the rows k to k + `TAIL_CYCLES`, multiplied by 1 + `TAIL_MARGIN`.
 TAIL = 16
-#: Columns 20 to 23 of `step` [1/rad]: columns 0 to 3, maximum over `SLACK_CYCLES` cycles from this cycle on.
+#: Columns 20 to 23 of `step` [1/rad], computed from columns 0 to 3 in the same order.
+#: Row k: largest value of the column in the rows k to k + `SLACK_CYCLES` - 1.
 NEAR = 20
 COLUMNS = 24
-#: For this number of cycles after the end of the prediction, the guide must still be wider than the last predicted error.
+#: Number of cycles after the end of the prediction in which the guide must still be wider than the last predicted error.
 TAIL_CYCLES = 60
-#: Fraction of the guide width that must remain free in the last predicted cycle.
-#: The free width keeps the error inside the guide in the cycles after the last predicted cycle.
+#: Relative margin: the guide width must be at least (1 + `TAIL_MARGIN`) * (error in the last predicted cycle).
+#: The margin keeps the error inside the guide in the cycles after the last predicted cycle.
 TAIL_MARGIN = 0.03
 
 
@@ -189,7 +193,7 @@ def write_bounds(step: Vector, bounds: Vector) -> None:
 
 
 def slide_maximum(table: Vector, first: int, end: int, cycles: int) -> None:
-    """Replace each value by the maximum of its column over `cycles` rows: its own row and the rows after it.
+    """Replace each value by the largest value of the same column in `cycles` rows, from the row of the value on.
 
     Args:
         table: values, shape (n, m), changed in place. The last row also stands for all rows after it.
