@@ -86,7 +86,7 @@ class CarryOver:
             limit[joint] = torque
 
     def cancel(self) -> None:
-        """Cancel the carry-over that the last call of `start` started, if `add_carried` has not been called after this call.
+        """Cancel the carry-over of the last call of `start`, if `add_carried` has not been called after this call.
 
         If the added torque already fades out, it continues to fade out.
         """

@@ -21,7 +21,7 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: Part of the error message of dask if the scheduler cannot load the calls, which requires an import of the called function.
+#: Part of the error message of dask if the scheduler cannot load the calls. Loading a call imports the called function.
 _FOREIGN: Final = "Error during deserialization of the task graph"
 #: Timeout of the connection of the first worker to the dask scheduler [s].
 _WORKER_TIMEOUT: Final = 10.0

@@ -22,7 +22,7 @@ class Requirements:
     sole_share: float = 0.6  # fraction of length and width of the sole in which the centre of pressure must stay
     #: Fraction of length and width of the rectangle between the force cells of the foot.
     #: At each node, the centre of pressure must be inside the reduced rectangle.
-    #: Between nodes, and in gaits from the gait network, the centre of pressure can be up to 3.2 mm outside.
+    #: Between nodes, and in gaits from the gait network, the centre of pressure can be up to 3.2 mm outside this rectangle.
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: m, smallest height of the swing sole at mid-swing.

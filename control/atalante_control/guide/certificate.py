@@ -58,7 +58,7 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")
-#: Smallest disturbance torque at the hip that is certified [Nm]. If the hip torque would be smaller, no torques are certified.
+#: Smallest disturbance torque at the hip that is certified [Nm]. If only a smaller one is possible, no torques are certified.
 SMALLEST = 1.0
 
 

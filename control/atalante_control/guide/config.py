@@ -32,9 +32,9 @@ class StepGuideConfig:
     torque_reserve: float = 14.0
     #: rad/s, smallest allowed distance of a predicted speed from the velocity limit of the robot
     speed_reserve: float = 0.2
-    #: Gain zeta [s]. While the safety value h falls, the weight w of the backup torque rises by (1 - w) * zeta * (-dh/dt).
-    #: Reason: the backup torque must act before h is negative, because a joint may leave the guide at a negative h.
-    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5. The weight is at most 1.
+    #: Gain zeta [s]. While the safety value h falls, the backup torque has the weight w + (1 - w) * zeta * (-dh/dt), at most 1.
+    #: Here, w is the weight at a constant h. Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: The backup torque must rise before h is negative, because a joint may leave the guide at a negative h.
     zeta: float = 0.01
     #: Factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques.
     #: While the backup torque has the weight w, u_i is multiplied by `idealization` * (1 - w) + w.

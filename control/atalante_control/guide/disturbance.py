@@ -33,8 +33,8 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 #: Largest spacing of the knee angles for which the mass matrix is computed in each cycle, without a start deviation [rad].
-#: A start deviation widens the range of the knee angles near the start of a step, but does not change their number.
-#: The spacing can therefore be larger near the start of a step.
+#: Near the start of a step, the start deviation widens the range of the knee angles.
+#: The number of knee angles stays the same, so the spacing is larger there.
 _SPACING = math.radians(7.5)
 
 

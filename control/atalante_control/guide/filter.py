@@ -56,9 +56,9 @@ class GuideConfig:
     rate_limit: float  # Nm, largest allowed change of the backup torque within one cycle
     speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the inertia and delay of the model
     worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
-    #: Gain zeta [s]. While the safety value h falls, the weight w of the backup torque rises by (1 - w) * zeta * (-dh/dt).
-    #: Reason: the backup torque must act before h is negative, because a joint may leave the guide at a negative h.
-    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5. The weight is at most 1.
+    #: Gain zeta [s]. While the safety value h falls, the backup torque has the weight w + (1 - w) * zeta * (-dh/dt), at most 1.
+    #: Here, w is the weight at a constant h. Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: The backup torque must rise before h is negative, because a joint may leave the guide at a negative h.
     zeta: float = 0.01
     #: s, time constant of the low-pass filter for dh/dt, the rate of change of the safety value h
     derivative_time: float = 0.005

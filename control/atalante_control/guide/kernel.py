@@ -46,9 +46,9 @@ class Guard:
     worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
     tracking: float  # share of a commanded torque change that a motor reaches within one cycle
     keep: float  # weight of the old value in the low-pass of the measured velocity
-    #: Gain zeta [s]. While the safety value h falls, the weight w of the backup torque rises by (1 - w) * zeta * (-dh/dt).
-    #: Reason: the backup torque must act before h is negative, because a joint may leave the guide at a negative h.
-    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5. The weight is at most 1.
+    #: Gain zeta [s]. While the safety value h falls, the backup torque has the weight w + (1 - w) * zeta * (-dh/dt), at most 1.
+    #: Here, w is the weight at a constant h. Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: The backup torque must rise before h is negative, because a joint may leave the guide at a negative h.
     zeta: float
     #: weight of the new value in the low-pass filter for `rate`, the rate of change of the safety value h
     smoothing: float
@@ -64,7 +64,7 @@ class Guard:
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors of hip and knee
     lag: Annotated[Vector, 2]  # rad/s, estimated error of the measured velocities of hip and knee: true minus measured
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: Magnitudes to which the effect of model errors is proportional.
+    #: Magnitudes of the state. The largest effect of model errors is a weighted sum of these magnitudes.
     #: Elements 2 and 3: abs(true error rate - measured error rate) of hip and knee [rad/s].
     #: All other elements: absolute value of the same element of `state`.
     magnitude: Annotated[Vector, STATES]
