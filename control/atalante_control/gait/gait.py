@@ -53,7 +53,7 @@ class GaitError(ValueError):
 
 @dataclass(frozen=True)
 class StepTables:
-    """Samples of a step, one per control cycle from 0 to T. The arrays have shape (N + 1, 12) and are read-only."""
+    """Samples of a step, one per control cycle, both ends included. The arrays have shape (N + 1, 12) and are read-only."""
 
     q: Vector  # rad, joint angles
     qd: Vector  # rad/s, joint speeds

@@ -40,8 +40,9 @@ JUMP_KEPT = 0.4  # fraction to which the speed jump of each gait at the stance c
 END_WEIGHT = 40.0  # weight of the squared angle errors at start and end of a step; the weight is 1 at the other samples
 #: Weight of acceleration errors [s2]: an acceleration error of 1 rad/s2 counts as much as an angle error of 0.05 rad.
 ACCELERATION_WEIGHT = 5e-2
-#: Rms length to which the target vectors of the training are scaled. Smaller targets give a smaller training loss.
-#: With smaller targets, L-BFGS would stop too early: it stops if an iteration reduces the loss by less than 2e-9.
+#: Rms length to which the target vectors of the training are scaled.
+#: L-BFGS stops if an iteration reduces the training loss by less than 2e-9.
+#: With smaller targets, the training loss would be smaller, and L-BFGS would stop too early.
 TARGET_SIZE = 10.0
 ALPHA = 1e-5  # penalty on the squared weights; keeps the gaits smooth between the subjects of the library
 SEED = 1  # seed of the initial weights

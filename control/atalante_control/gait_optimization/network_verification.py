@@ -19,7 +19,7 @@ from atalante_hal.robot import Robot
 
 
 class WorstCheck(NamedTuple):
-    """Line of the report about one check: its largest value in all gaits, its limit, and the number of gaits that fail."""
+    """Line of the report about one check: largest value in all gaits, limit, and number of gaits that fail the check."""
 
     name: str
     value: float
