@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-#: Attributes that the parser requires. Each needs a definition (`BA_DEF_`) and a default (`BA_DEF_DEF_`).
+#: Attributes that the parser requires. Each attribute needs a definition (`BA_DEF_`) and a default (`BA_DEF_DEF_`).
 _REQUIRED = (
     "NominalBitrate", "DataBitrate", "NodeKind", "NodeNumber", "VFrameFormat", "Bus", "GenMsgSendType", "GenMsgCycleTime",
     "GenMsgDelayTime", "TimeoutTime", "E2EDataId", "InvalidRaw",
@@ -44,7 +44,7 @@ def missing(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _valid_values(name: str, kind: str, domain: str, value: str, *, by_name: bool) -> str:
-    """If `value` is invalid, return the valid values as text; otherwise return an empty text.
+    """Return the valid values as text if `value` is invalid. If `value` is valid, return an empty text.
 
     Args:
         name: name of the attribute.

@@ -95,7 +95,7 @@ class Layout:
     #: Mask of the identifier bits that distinguish the message from other messages.
     #: For a J1939 message, these bits are the parameter group. For any other message, these bits are the whole identifier.
     pgn_mask: int
-    #: Known raw values of each multiplexer: values that select a signal, and values with a name. Key: name of the multiplexer.
+    #: Name of each multiplexer -> its known raw values: values that select a signal, and values with a name.
     multiplexers: Mapping[str, frozenset[int]]
 
     def field(self, name: str) -> Field:
@@ -343,7 +343,7 @@ def _field(signal: RawSignal, selectors: tuple[tuple[str, frozenset[int]], ...])
 
 
 def _invalid_raw(signal: RawSignal) -> int | None:
-    """Return the raw code that means "no value"; None if there is none.
+    """Return the raw code that means "no value"; None if the signal has no such code.
 
     The default of the attribute is ignored: a default of 0 would make the value 0 of every signal invalid.
     """

@@ -1,4 +1,4 @@
-"""Literal law: assistive torque of hip and knee exactly as Gurriet et al., 2019, print it: `measured motion -> torque u_a`.
+"""Literal law, the control law exactly as printed in Gurriet et al. (2019): `measured motion of hip and knee -> torque u_a`.
 
 The literal law is for comparisons with this paper. Its certificate contains no certified torques: it is not proven that the
 joints stay inside the guide under any disturbance torque.
@@ -46,8 +46,8 @@ class LiteralRecord:
     coulomb: Annotated[Vector, 2]  # Nm, Coulomb friction k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, viscous friction k_v
     push: Annotated[Vector, 2]  # Nm, largest absolute value of the external torque u_ext
-    #: s, gain zeta: the weight of the backup torque u_b is larger while the safety value h falls, and smaller while h rises.
-    #: With zeta = 0, the rate of change of h has no effect.
+    #: Gain zeta [s] of the rate of change of the safety value h. While h falls, zeta increases the weight of the backup
+    #: torque u_b. While h rises, zeta decreases this weight. With zeta = 0, the rate of change of h has no effect.
     zeta: float
     idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
     xi: float  # assistance factor of the step, from 0 (widest guide) to 1 (narrowest guide)
@@ -62,7 +62,9 @@ class LiteralTables(NamedTuple):
     step: Vector  # (cycles + 1, 8) one row per cycle of the step; columns: see `BOUND`, `REFERENCE` and `FEEDFORWARD`
 
 
-BOUND = 0  # columns 0 to 3 of `step` [rad]: distance from q_des to hip upper, hip lower, knee upper, knee lower bound
+#: Columns 0 to 3 of `step`: distances from q_des to the guide bounds [rad].
+#: Order of the bounds: hip upper, hip lower, knee upper, knee lower.
+BOUND = 0
 REFERENCE = 4  # columns 4 and 5 of `step` [rad/s2]: desired acceleration q_des'' of sagittal hip and knee
 FEEDFORWARD = 6  # columns 6 and 7 of `step` [Nm]: feedforward torque of hip and knee, u_f * `LiteralConfig.feedforward`
 
@@ -73,8 +75,8 @@ class LiteralConfig:
 
     gains: LegGains  # PID gains of the swing leg; kp and kd of SH and SK are also the gains of the backup torque u_b
     push: Pair  # Nm, largest absolute value of the external torque u_ext of sagittal hip and knee
-    #: s, gain zeta: the weight of the backup torque u_b is larger while the safety value h falls, and smaller while h rises.
-    #: With zeta = 0, the rate of change of h has no effect.
+    #: Gain zeta [s] of the rate of change of the safety value h. While h falls, zeta increases the weight of the backup
+    #: torque u_b. While h rises, zeta decreases this weight. With zeta = 0, the rate of change of h has no effect.
     zeta: float
     idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
     feedforward: float  # factor in [0, 1] on the feedforward torque u_f
@@ -175,7 +177,7 @@ def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate:
 
 
 def _largest_ratio(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float, side: float) -> float:
-    """Simulate the rest of the step under a constant push. Return the largest ratio of tracking error to guide width.
+    """Simulate the rest of the step under a constant push. Return the largest |e| / q_bound.
 
     The torque on the joint is the sum of the feedforward torque, the backup torque (PD feedback) and the push. The push is
     the largest external torque `LiteralRecord.push` in the direction `side` (1 or -1).

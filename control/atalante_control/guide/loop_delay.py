@@ -1,4 +1,4 @@
-"""Additional delay of the control loop, compared with the delay that the guides cover: `delay at START, ages -> late or not`.
+"""Check whether the guides cover the additional delay of the control loop: `delay at START, ages -> late or not`.
 
 The certificate of a guide covers a loop with one more cycle of delay than normal (`prediction.DELAYS`). With more delay, the
 backup policy may oscillate. So a step starts without a guide, or its guide ends early, and the patient gets full assistance.
@@ -14,8 +14,8 @@ from atalante_hal.types import State
 
 #: Largest additional delay that the certificate of a guide covers [cycles].
 COVERED: Final = DELAYS[1] - DELAYS[0]
-#: The delay is confirmed as uncovered after this number of consecutive cycles in which the certificate does not cover it.
-#: A single lost frame also makes the data old, but does no harm. The HAL tolerates the loss of up to a fifth of the frames.
+#: Number of consecutive cycles with an uncovered delay after which the fault is confirmed. A single lost frame is no fault,
+#: although it makes the data old for a cycle. The HAL tolerates the loss of up to a fifth of the frames.
 _CONFIRM: Final = 5
 # Indices in JOINTS of the joints with a guide: sagittal hip and knee of both legs.
 _LEFT_SH, _LEFT_SK, _RIGHT_SH, _RIGHT_SK = (JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SH", "SK"))
@@ -62,7 +62,7 @@ class LoopDelay:
 
     @property
     def confirmed(self) -> bool:
-        """Return whether the last `_CONFIRM` counted cycles, or START and all cycles since then, had an uncovered delay."""
+        """Return whether the delay was uncovered at START and in all cycles since, or in the last `_CONFIRM` cycles."""
         return self._uncovered >= _CONFIRM
 
 

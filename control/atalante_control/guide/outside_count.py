@@ -1,10 +1,10 @@
-"""Detection of a safety value h that is negative in too many cycles, by a counter with a limit."""
+"""Counter with a limit, which detects that the safety value h is negative in too many cycles."""
 
 from __future__ import annotations
 
 
 class OutsideCount:
-    """Counter that rises in each cycle with h < 0 in a guide with certified torques, and falls in every other cycle.
+    """Counter of the cycles with h < 0 in a guide with certified torques. In every other cycle, the counter falls.
 
     If the safety value h is negative, the backup policy may not be able to keep the joints inside the guide.
     """

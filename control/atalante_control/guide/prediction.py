@@ -23,7 +23,7 @@ Pair = tuple[float, float]
 
 #: Smallest and largest number of cycles between a measurement and the torque that is computed from it.
 DELAYS = (1, 2)
-#: Torques and speeds are predicted only for these numbers of cycles ahead. Tracking errors are predicted for every cycle.
+#: Horizons of the predicted torques and speeds [cycles]. Tracking errors are predicted for every cycle.
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
 #: Typical magnitude of each of the 10 elements of the leg state (errors, rates and accelerations, see `backup_policy.STATES`).
 #: The compression of the state divides by these magnitudes, because the elements have different units.
@@ -62,7 +62,7 @@ class Assumptions:
 
 
 class StartReach(NamedTuple):
-    """Largest deviations of hip and knee in each cycle of a step, if disturbances act from the start of the step on.
+    """Largest deviations of hip and knee in each cycle of a step. Disturbances act from the start of the step.
 
     Row i: cycle i of the step. Columns 0 and 1: deviations of SH and SK due to the model errors (`Leg.budget`). Columns 2 and 3:
     deviations of SH and SK due to the requested disturbance torques.
@@ -158,10 +158,10 @@ class Prediction:
         # Example: a joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
         # `few_ahead`: largest changes of predicted torques [Nm] and speeds [rad/s] that disturbances can cause.
-        # Axis 0: torque and speed of the loop without model errors (0 and 1), largest speed of all loops in `family` (2).
+        # Axis 0: torque of the loop without model errors, speed of the same loop, largest speed of all loops in `family`.
         # Axis 1: start of the prediction. Element k is for the start cycles k * START_CYCLES to (k + 1) * START_CYCLES - 1.
         # Axis 2: element i is for the prediction FEW[i] cycles ahead.
-        # Axis 3: hip and knee due to model errors (0 and 1), hip and knee due to the torques `Assumptions.promise` (2 and 3).
+        # Axis 3: hip and knee under model errors, then hip and knee under the torques `Assumptions.promise`.
         few_ahead = np.zeros((3, blocks, len(FEW), 4))
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
@@ -186,7 +186,7 @@ class Prediction:
         )
 
 
-#: Cached tables of the last gaits and gains, the least recently used first.
+#: Cached tables of the last gaits and gains, in the order of their last use. The first table is deleted first.
 _kept: dict[bytes, Prediction] = {}
 _MOST_KEPT = 8
 
@@ -216,7 +216,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _for_rate_difference(rows: Vector) -> Vector:
-    """Convert prediction matrices for a state whose elements 2 and 3 are the differences true - measured error rate.
+    """Convert prediction matrices to a state with the differences of the error rates (true minus measured) in elements 2 and 3.
 
     The given matrices multiply a state in which elements 2 and 3 are the true error rates of SH and SK. Elements 4 and 5 are the
     measured error rates. The returned matrices multiply a state in which elements 2 and 3 are the differences true - measured.

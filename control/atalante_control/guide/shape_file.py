@@ -97,7 +97,7 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
 
 
 def _warped(phase: Vector, knots: Vector) -> Vector:
-    """Convert phases so that `np.interp` (linear) at the new phases gives a half-cosine interpolation.
+    """Convert phases so that a linear interpolation (`np.interp`) at the new phases gives half-cosine transitions.
 
     Between two knots, a half-cosine interpolation follows half a period of a cosine in place of a straight line. Example: the
     phase at one quarter of the way between two knots becomes the phase at 15 % of this way.

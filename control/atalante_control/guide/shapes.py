@@ -15,7 +15,7 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-#: Half-width to which the shape `pinched` closes [rad]. A guide with a smaller half-width at the start does not close.
+#: Final half-width of the shape `pinched` [rad]. If the half-width at the start is smaller, it stays constant.
 PINCH_WIDTH = math.radians(1.0)
 SNAP_WIDTH = math.radians(0.1)  # rad, half-width of the shape `snap` in the narrow part of the step
 #: Smallest valid distance from the desired trajectory to a bound of a guide [rad], about two encoder counts at the joint.

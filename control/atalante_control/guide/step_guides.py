@@ -1,4 +1,4 @@
-"""Virtual guides of a walk: some guide filters of different stiffness, from which one is selected for each step.
+"""Virtual guides of a walk: several guide filters with different stiffnesses. One filter is selected for each step.
 
 `assistance factor -> guide filter, promise, certificate`. The walk is in the air or on the ground. The backup policy is
 the spring and damper that returns the leg to its desired trajectory. A narrow guide requires a stiff backup policy, but a stiff
@@ -22,7 +22,7 @@ from atalante_control.joint.idealization import AssistedInertia
 from atalante_hal.robot import LEG_JOINTS, Robot
 from atalante_hal.types import PERIOD, Vector
 
-#: Knee angle [rad] at which the gains of the backup policy (spring and damper) are computed, in the middle of the swing.
+#: Knee angle in the middle of the swing [rad]. The gains of the backup policy (spring and damper) are computed at `_MIDDLE`.
 #: At any knee angle other than `_MIDDLE`, mass matrix and stiffness of the joints are different, see `BackupPolicy.mass`.
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
@@ -102,7 +102,8 @@ class StepGuides:
         Args:
             xi: assistance factor in [0, 1].
         """
-        number = math.ceil(round(xi * _FACTORS, 6))  # `round` first: in floating point, 0.07 * 100 is above 7
+        # Without `round`, the number for 0.07 would be 8, because 0.07 * 100 is above 7 in floating point.
+        number = math.ceil(round(xi * _FACTORS, 6))
         if number not in self._choices:
             self._choices[number] = self._choose(number / _FACTORS)
         return self._choices[number]

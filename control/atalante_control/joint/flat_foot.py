@@ -299,7 +299,7 @@ def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair,
 
 
 def _target(ankle: Ankle, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Return angles and rates of sagittal and henke ankle that hold the sole level, with offset and limits applied."""
+    """Return the flat-foot angles and rates of sagittal and henke ankle, with offset and limits applied."""
     (sagittal, henke), rates = level(ankle.geometry, tibia, gyro)
     low, high = ankle.low, ankle.high
     sa, sa_rate = _within(sagittal + ankle.offset, rates[0], low[0], high[0])
@@ -314,9 +314,9 @@ def _within(angle: float, rate: float, low: float, high: float) -> Pair:
 
 
 def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Return the angles of sagittal and henke ankle (SA, HA) that level the sole.
+    """Return the angles of sagittal and henke ankle (SA, HA) with which the sole is horizontal.
 
-    If the tibia leans so far sideways that no angle of HA levels the sole, HA gets the nearest possible angle.
+    If the tibia leans so far sideways that no angle of HA makes the sole horizontal, HA gets the nearest possible angle.
 
     Args:
         geometry: `FlatFoot.geometry`.

@@ -34,7 +34,8 @@ _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
 class Law:
     """Parameters of `idealization` for the assisted joints, sagittal hip and knee."""
 
-    fit: Annotated[Vector, (3, 3)]  # kg m2, rows: M11, M12, M22; columns: A, B, C in M = A + B cos(knee) + C sin(knee)
+    #: Coefficients A, B, C of the mass matrix [kg m2]: M = A + B cos(knee) + C sin(knee). Row: M11, M12, M22. Column: A, B, C.
+    fit: Annotated[Vector, (3, 3)]
     coulomb: Annotated[Vector, 2]  # Nm, Coulomb friction k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, viscous friction k_v
     smoothing: float  # rad/s, smoothing speed v_s

@@ -107,8 +107,8 @@ class Pid:
         self.records: Records[PidRecord] = zeros(PidRecord, 1)
         self.limit_integral(gains.integral_limit)
         self._torque = np.zeros(n)
-        # Copies of q, qd and sent. For numba, a read-only array is another type. With such an array, numba would compile the
-        # kernel again, in the control loop.
+        # Writable copies of q, qd and sent. For a read-only array, numba would compile the kernel again in the
+        # control loop, because a read-only array has another type.
         self._inputs = np.zeros(n), np.zeros(n), np.zeros(n)
         self.start_step(RIGHT, np.ones(n))
         self._kernel = compiled(control)

@@ -32,7 +32,7 @@ class Segment:
 
 #: Body segments from D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009.
 #: Mass, centre, gyration and density are from table 4.1, length is from figure 4.1 (after Drillis and Contini).
-#: HAT is head, arms and trunk, with the length from hips to shoulders and the mean density of all its parts.
+#: HAT is head, arms and trunk. Its length is from hips to shoulders. Its density is the mean of all parts.
 #: Thigh, shank and foot are the segments of one side of the body.
 SEGMENTS = {
     "HAT": Segment(0.678, 0.626, 0.496, 0.288, 1050.0),

@@ -135,7 +135,8 @@ def observe(attitudes: Records[Attitude], gyro: Vector, accel: Vector, measured:
     )
     for k in range(3):
         velocity[k] += (accel[k] - turning[k] + gravity[k] + 2.0 * w * error[k]) * PERIOD
-    # Rotate by the Taylor series up to second order. The matrix stays orthogonal up to an error of third order in the angle.
+    # Rotate with the Taylor series of the rotation matrix up to second order. The rotation has an error of third order in the
+    # angle. The error of the orthogonality is of fourth order.
     for row in range(3):
         a, b, c = rotation[row, 0], rotation[row, 1], rotation[row, 2]
         da, db, dc = b * z - c * y, c * x - a * z, a * y - b * x

@@ -18,14 +18,14 @@ from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
 
-#: Default of `WalkConfig.steering`. The transverse hip turns by at most 3 degrees.
-#: The transverse hip turns by 0.5 rad per rad of heading error, plus 0.15 rad per metre of sideways deviation from the path.
+#: Default of `WalkConfig.steering`. The transverse hip turns by 0.5 rad per rad of heading error, plus 0.15 rad per metre of
+#: sideways deviation from the path. Without a turn, the limit of the sum is 3 degrees.
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
-#: Largest absolute value of `WalkConfig.turn` [rad]: the angle by which the straight path turns before each periodic step.
+#: Largest absolute value of `WalkConfig.turn` (rotation of the walking direction before each periodic step) [rad].
 #: With a turn of 5 degrees, a passive patient of 91 kg and 1.93 m fell in guided steps at assistance factor 0.
-#: An active patient of 91 kg and 1.93 m had DCM errors up to 0.15 m with a turn of 3 degrees, and 0.19 m with 4 degrees.
+#: With an active patient of 91 kg and 1.93 m, the largest DCM error was 0.15 m at 3 degrees, and 0.19 m at 4 degrees.
 TURN_MAX = math.radians(3.0)
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
 #: The PIDs act against the ankle stabiliser, so the integral terms of the two legs drifted apart.
@@ -55,28 +55,28 @@ class WalkConfig:
 
     gains: PidGains = WALK_GAINS
     #: Fraction by which each cycle of delay (`State.delay`) reduces the derivative gains of the stance leg (SH, SK, SA).
-    #: With a delay of d cycles, the gains are multiplied by 1 - damping_loss * d. Example: 1 - 3/12 = 0.75 for d = 3.
+    #: With a delay of d cycles, the gains are multiplied by 1 - damping_loss * d. Example: the default gives 0.75 for d = 3.
     #: With full gains and a delay of 3 cycles, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     #: Duration of the re-centring, as a fraction of the duration of the step or weight shift.
     #: During the re-centring, the desired motion returns from the measured pose to the nominal motion.
     alpha: float = 0.3
-    #: True: the periodic steps use the control law exactly as Gurriet et al., 2019, print it, see `WalkConfig.literal`.
-    #: If True, the guide of the periodic steps is not certified.
+    #: True: the periodic steps use the literal law, exactly as printed in Gurriet et al. (2019), see `WalkConfig.literal`.
+    #: The guide of the periodic steps is then not certified.
     literal_law: bool = False
-    #: m/m, the ankle stabiliser shifts the centre of pressure by this distance per metre of DCM error.
+    #: Gain of the ankle stabiliser [m/m]: shift of the centre of pressure per metre of DCM error.
     #: DCM: divergent component of motion.
     stabiliser: float = 2.5
-    shift_limit: Pair = (0.12, 0.05)  # m, largest shift of the centre of pressure: along the walk; sideways
+    shift_limit: Pair = (0.12, 0.05)  # m, largest shift of the centre of pressure (along the walk, sideways)
     #: m, smallest permitted distance from the centre of pressure to the front edge and to the rear edge of the stance sole.
-    #: The torque of the sagittal ankle is limited so that the centre of pressure keeps this distance.
+    #: The torque of the sagittal ankle is limited so that the centre of pressure keeps the distance `edge`.
     edge: float = 0.005
     placement: PlacementConfig = field(default_factory=PlacementConfig)  # parameters of foot placement and step timing
     lean: LeanConfig = field(default_factory=LeanConfig)  # parameters of the lean of the trunk
-    flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
+    flat_foot: bool = True  # whether the ankle of the swing leg holds the sole horizontal
     #: m/s, downward speed of a late swing foot (a swing foot that has not landed at the nominal end of the step).
-    #: Value 0 applies to the start step and to the periodic step. Value 1 applies to the stop step.
+    #: Element 0 applies to the start step and to the periodic step. Element 1 applies to the stop step.
     reach_speed: Pair = (0.3, 0.03)
     #: s, longest time for which a late swing foot moves down. Hip and knee stop earlier if the knee angle falls to `reach_knee`.
     reach_time: float = 0.2
@@ -85,12 +85,12 @@ class WalkConfig:
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
     #: Steering adds an offset to the transverse hip.
-    #: Value 0: offset of the hip per heading error [rad/rad]. Value 1: offset per sideways deviation from the path [rad/m].
-    #: Value 2: largest offset of the hip [rad], without a turn. A turn increases the largest offset by abs(`turn`).
+    #: Element 0: offset of the hip per heading error [rad/rad]. Element 1: offset per sideways deviation from the path [rad/m].
+    #: Element 2: largest offset of the hip [rad], without a turn. A turn increases the largest offset by abs(`turn`).
     steering: tuple[float, float, float] = STEERING
-    #: rad, angle by which the straight path of the robot turns before each periodic step, positive to the left
+    #: rad, rotation of the walking direction before each periodic step, positive to the left
     turn: float = 0.0
-    #: s, longest wait for a landing after the nominal end of a step. Then the step ends without a detected landing.
+    #: s, longest wait for a landing after the nominal end of a step. After the wait, the step ends without a detected landing.
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
@@ -101,10 +101,10 @@ class WalkConfig:
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
     #: Smallest load on a foot with which the full stance gains apply, as a fraction of the weight.
     #: If the foot carries less load, the gains are between the swing gains (no load) and the stance gains.
-    #: Value 0 applies to each leg while the robot stands. Value 1 applies to the ankle of the stance leg during a step.
+    #: Element 0 applies to each leg while the robot stands. Element 1 applies to the ankle of the stance leg during a step.
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
-    #: m, largest distance between the soles, along the walk, with which a robot on the ground may start a walk.
+    #: m, largest permitted distance of one foot ahead of the other at the start of a walk on the ground.
     #: The motion to the standing pose moves both feet at once, so a robot with one foot ahead would fall.
     stride: float = 0.05
     posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose
@@ -136,7 +136,7 @@ class WalkConfig:
         return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
 
     def leg_gains(self, delay: int = 0) -> Vector:
-        """Return the PID gains of all joints, once as joints of a swing leg and once as joints of a stance leg.
+        """Return two sets of PID gains for all joints: the gains of a swing leg and the gains of a stance leg.
 
         Args:
             delay: number of cycles by which torques act late, `State.delay`.

@@ -14,7 +14,7 @@ _LARGEST_TWIST = 60.0
 
 
 def contact_force(load: float, twist: float) -> float:
-    """Return the vertical force of the floor on a foot [N], corrected for one cell that reads too much.
+    """Return the vertical force of the floor on a foot [N], corrected for one cell with too large a value.
 
     The sole is a rigid plate on four equal cells. Wherever the floor acts, the sum of the forces on FL and RR is equal to the sum
     on FR and RL. The difference, the twist, is therefore the error of a wrong cell. A twist that is larger than the noise is
@@ -36,13 +36,14 @@ class ImpactConfig:
     """
 
     impact_force: float = 80.0  # N, smallest vertical force on the swing foot at an impact
-    #: N, the swing foot has left the ground when its vertical force is below `release_force`.
-    #: Until then, only an impact with at least `certain_rise` is accepted.
+    #: N, vertical force on the swing foot below which the foot has left the ground.
+    #: Before the foot has left the ground, only an impact with a rise of at least `certain_rise` is accepted.
     release_force: float = 30.0
-    debounce: int = 5  # an impact is detected after this number of consecutive cycles with at least `impact_force`
-    earliest: float = 0.5  # impacts are ignored before this fraction of the step duration
-    #: N, smallest rise of the vertical force at an impact, above its smallest value in this step. It applies if this value is not
-    #: below `release_force`. Such a foot may still be in the air: its cells report a load, for example because a strap pulls.
+    debounce: int = 5  # number of consecutive cycles with sufficient force after which an impact is detected
+    earliest: float = 0.5  # fraction of the step duration before which impacts are ignored
+    #: Smallest rise of the vertical force at an impact [N], measured from the smallest force in the step.
+    #: `certain_rise` applies while the force in the step has not been below `release_force`.
+    #: The foot may then be in the air although its cells report a load, for example because a strap pulls.
     #: Without `certain_rise`, the landing of such a foot would not be detected.
     certain_rise: float = 220.0
 
@@ -72,7 +73,7 @@ class ImpactDetector:
     def start_step(self) -> None:
         """Reset the detector at the start of a step.
 
-        Until the new swing foot has left the ground, only impacts with at least `certain_rise` are accepted.
+        Until the new swing foot has left the ground, only impacts with a rise of at least `certain_rise` are accepted.
         """
         self._lowest, self._count = math.inf, 0
 

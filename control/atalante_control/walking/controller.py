@@ -65,14 +65,14 @@ _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _TH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("TH", "SH", "SK"))
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
 _TIBIAE = [IMUS.index(f"{side}_tibia") for side in FEET]
-#: Lean and foot placement request only joint angles that are at least this far inside the position limits [rad].
+#: Smallest distance from a joint angle that lean or foot placement requests to the position limit [rad].
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 SENSOR_AGE = 10
 #: Largest expected difference between the weight and the load on the stance foot, as a fraction of the weight.
 #: While one foot swings, the load on the stance foot differs from the weight, because the robot accelerates.
 _LOAD_ERROR = 0.15
-#: s, time constant with which roll and pitch approach the values computed from the stance leg, if a trunk IMU was implausible.
+#: Time constant of the correction of roll and pitch after a trunk IMU was implausible [s]. The stance leg gives the new values.
 #: With a correction in a single cycle, the ankles that hold the swing foot level could exceed their velocity limit.
 _LEVEL_TIME = 0.02
 #: m, height above the stance foot up to which the swing foot counts as landed while the data of both feet is lost
@@ -80,7 +80,7 @@ _LANDED_HEIGHT = 0.001
 
 
 class StanceError(ValueError):
-    """Error for a pose on the ground from which a walk cannot start."""
+    """Error: a walk cannot start, because the robot stands on the ground with one foot ahead of the other."""
 
 
 class WalkController:
@@ -366,7 +366,7 @@ class WalkController:
         imu = self._measured.imu
         self._measure(state)
         if self._gyro_source != TRUNK and not self._distrusted.isdisjoint(self._imus):
-            # The attitude contains the error of the implausible data.
+            # The implausible data has already changed the attitude.
             self._observer.level(self._vertical_of_stance_leg(state), _LEVEL_TIME)
         if self._measured.imu is not imu:
             self._observer.change_imu(self._measured.gyro, self._measured.imu - imu)
@@ -618,7 +618,7 @@ class WalkController:
         command.guide_left = self._outside.update(command.outside, self._promised)
 
     def _check_hand_over(self) -> bool:
-        """Return whether a step starts with larger deviations than its guide is certified for, and count the step.
+        """Return whether the start deviations of a step exceed the deviations for which its guide is certified. Count the step.
 
         The guide is certified for deviations inside the hand-over box (`HandOver`). Only steps with a certified guide are checked
         and counted. The torque jump is known after the first cycle of the step.

@@ -63,7 +63,7 @@ class Measured(NamedTuple):
     #: (3,) rad/s, angular velocity of the IMU in the axes of the IMU. `sense` writes it if `Stage.gyro_source` is not `TRUNK`.
     gyro: Vector
     accel: Vector  # (3,) m/s2, specific force at the IMU in the axes of the IMU
-    force: Vector  # (2, 4, 3) N, force at each force cell in the foot frame; the axes are foot, cell and x/y/z
+    force: Vector  # (2, 4, 3) N, force at each force cell in the foot frame; axes of the array: foot, cell, x/y/z
     sent: Vector  # (12,) Nm, torque command of the previous cycle after the limiter
     tibiae: Vector  # (2, 3) rad/s, angular velocities of the left and the right tibia IMU, in the axes of the IMU
 
@@ -79,8 +79,8 @@ class Stage:
     #: rad/s, joint speeds at the start of the phase minus the speeds in the first row of the phase table
     rate: Annotated[Vector, len(JOINTS)]
     placed: bool  # True: foot placement and step timing react to pushes in this phase
-    literal: bool  # True: as in the paper, joints without a guide get only PID torques, see `WalkConfig.literal`
-    flat: bool  # True: the sole of the swing foot is held level
+    literal: bool  # True: joints without a guide get only PID torques, as in the paper, see `WalkConfig.literal`
+    flat: bool  # True: the sole of the swing foot is held horizontal
     #: True: the virtual guide drives sagittal hip and knee of the swing leg, so the patient can move them within bounds.
     #: False: the baseline controller (PID) drives all joints, for example at assistance factor 1 or in the start step.
     assisted: bool
@@ -112,7 +112,7 @@ class Constants(NamedTuple):
     """Constants of the kernel."""
 
     weight: float  # N, weight of robot and patient
-    keep: float  # weight of the previous value in the low-pass of the foot forces, 0 to 1
+    keep: float  # coefficient of the previous value in the low-pass of the foot forces, 0 to 1
     standing_gains: float  # N, while standing: smallest load on a foot with which its leg has the full stance gains
     walking_gains: float  # N, in a step: smallest load with which the stance ankle has the full stance gains
     gains: Vector  # (2, 3, 12) gains of swing leg and stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad]
@@ -372,7 +372,7 @@ def act(
     if stage.assisted:
         _assist(cycle, measured, assistance, parts)
     requested = parts.pids[0].requested
-    for joint in range(len(requested)):  # no `requested[:] = torque`, which would allocate an array
+    for joint in range(len(requested)):  # `requested[:] = torque` would allocate an array
         requested[joint] = torque[joint]
     write_telemetry(parts.telemetry, cycle * PERIOD, not stage.double, desired, sensed.load, balance, up)
 
@@ -457,7 +457,7 @@ def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, par
 
 
 def _hold_foot(row: int, table: PhaseTable, parts: Parts) -> None:
-    """Move the desired swing ankle to its nominal position relative to the stance foot, shifted by the landing offset.
+    """Move the desired swing ankle to a position relative to the stance foot: the nominal position plus the landing offset.
 
     The landing offset is the shift of the landing position that foot placement requests.
 

@@ -29,9 +29,9 @@ from atalante_hal.types import PERIOD
 class LeanConfig(NamedTuple):
     """Parameters of the lean."""
 
-    gain: float = 6.0  # rad/m, lean per metre of DCM error beyond `dead_zone`; 0: the trunk does not lean
+    gain: float = 6.0  # rad/m, lean per metre of DCM error beyond `dead_zone`; with gain 0, the trunk does not lean
     dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
-    #: m, the trunk leans over the stance foot only if the sideways position of the DCM is below this value.
+    #: m, sideways position of the DCM below which the trunk may lean over the stance foot.
     #: The DCM position is relative to the middle of the stance sole, and positive towards the swing foot.
     inside: float = 0.015
     outward: float = 0.22  # rad, largest lean over the stance foot
@@ -39,8 +39,8 @@ class LeanConfig(NamedTuple):
     rise: float = 14.0  # rad/s, natural frequency of the lean motion (critically damped) while the trunk leans further
     fall: float = 5.0  # rad/s, natural frequency of the lean motion (critically damped) while the trunk returns
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
-    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per metre of DCM beyond `leg_zone`; 0: no shift
-    #: m, the swing foot moves outwards if the sideways position of the DCM is above this value.
+    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per metre of DCM position beyond `leg_zone`; 0: no shift
+    #: m, sideways position of the DCM above which the swing foot moves outwards.
     #: The DCM position is relative to the middle of the stance sole, and positive away from the swing foot.
     leg_zone: float = 0.02
     leg: float = 0.15  # m, largest shift of the swing foot away from the stance foot

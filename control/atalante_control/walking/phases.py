@@ -41,7 +41,7 @@ class Facts(NamedTuple):
     elapsed: int
     nominal: int  # nominal duration of the phase in cycles
     rest: int  # cycles to wait after a weight shift
-    timeout: int  # a step without a detected landing ends this number of cycles after its nominal end
+    timeout: int  # cycles from the nominal end of a step to its end without a detected landing
     landed: bool  # the swing foot has landed
     loaded: bool  # both feet have carried load for long enough
     stopping: bool  # the walk must end

@@ -42,10 +42,11 @@ _FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
 _SHIFTING = (_FH, _SH, _SK)
 #: Number of joints from the pelvis to the ankle.
 _LINKS = LEG_JOINTS.index("SA") + 1
-#: m3, smallest absolute determinant of the ankle Jacobian with which the foot is shifted.
-#: With a smaller determinant, the leg is almost straight (singular), and the foot is not shifted further.
+#: Smallest absolute determinant of the ankle Jacobian [m3] for a shift of the foot.
+#: If the determinant is smaller, the leg is almost straight (singular), and the foot is not shifted further.
 _SINGULAR = 1e-3
-#: `landing` compares `_RATES` + 1 phase rates from `slowest` to `fastest`, with a constant ratio between neighbouring rates.
+#: `landing` compares the phase rate 1 and `_RATES` + 1 phase rates from `slowest` to `fastest`.
+#: The ratio between neighbouring rates is constant.
 _RATES = 32
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
@@ -58,7 +59,7 @@ class PlacementConfig(NamedTuple):
     larger, because the trunk leans in addition.
     """
 
-    #: m, foot placement and step timing ignore a DCM error that is predicted to be smaller than this value at the landing.
+    #: m, predicted DCM error at the landing up to which foot placement and step timing do not react.
     #: If `dead_zone` is infinite, foot placement and step timing are off.
     dead_zone: float = 0.015
     forward: float = 0.15  # m, largest shift of the landing position forwards and backwards
@@ -66,21 +67,20 @@ class PlacementConfig(NamedTuple):
     inward: float = 0.02  # m, largest shift of the landing position towards the stance foot
     slowest: float = 0.1  # smallest phase rate; the phase rate is the speed of the step relative to the gait
     fastest: float = 1.6  # largest phase rate
-    #: s, the DCM error is ignored for this time after the start of a step, because the new stance foot is not yet at rest
+    #: s, time from the start of a step until the DCM error is used. Before, the new stance foot is not yet at rest.
     settled: float = 0.08
     #: s, duration of the last part of a step, up to the nominal landing. In this part, the phase rate returns to 1.
     #: In the last part of a step, the landing offset follows from the present DCM error, not from a prediction (`late_landing`).
     frozen: float = 0.05
-    #: m, largest DCM error (forwards, sideways) whose growth ankle and trunk can stop. A larger error grows until the landing.
+    #: m, largest DCM error (forwards, sideways) that ankle and trunk can reduce. A larger error grows until the landing.
     capacity: Pair = (0.10, 0.08)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped motion of the landing offset
     speed: float = 1.2  # m/s, largest speed at which the landing offset changes
     acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
-    #: The needed landing offset may exceed the limits `forward`, `outward` and `inward`.
-    #: `_cost` multiplies the squared excess by this weight.
+    #: Weight in `_cost` of the squared excess of the needed landing offset over the limits `forward`, `outward` and `inward`.
     missed: float = 30.0
-    #: m, weight in `_cost` of a change dt of the landing time.
-    #: The change costs as much as a landing offset of `timing` * w * dt, where w is the natural frequency.
+    #: m, weight in `_cost` of the change of the landing time. A change by the time dt costs as much as a landing offset of
+    #: `timing` * w * dt, where w is the natural frequency.
     timing: float = 0.03
     #: s, time in which the goal of the swing leg changes from joint angles to foot positions, after the first reaction to a push.
     #: The foot positions are relative to the stance foot, so a tilt of the pelvis does not move the swing foot.
@@ -113,7 +113,7 @@ class Motion(NamedTuple):
     error: Pair  # m, measured minus nominal DCM in the walking frame
     nominal: Pair  # m, nominal DCM now
     final: Pair  # m, nominal DCM at the nominal landing
-    exponent: float  # w t, natural frequency times time to the nominal landing, above 0
+    exponent: float  # product w t, above 0; w is the natural frequency, t is the time to the nominal landing
     side: float  # direction from stance foot to swing foot: 1 left, -1 right
 
 
@@ -128,7 +128,7 @@ def predicted(error: float, gain: float, limit: float, exponent: float) -> float
         gain: gain k of the ankle stabiliser, at least 0. Between 0 and 1, the result is too small for an error that grows beyond
             L / k.
         limit: largest shift L of the centre of pressure [m].
-        exponent: w t, natural frequency times time to the landing.
+        exponent: product w t of the natural frequency w and the time t to the landing.
     """
     size = abs(error)
     linear = limit / gain if gain > 0.0 else math.inf  # m, DCM error at which the ankle stabiliser reaches its limit

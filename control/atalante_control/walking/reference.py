@@ -49,11 +49,11 @@ class PhaseTable(NamedTuple):
     guided: Vector  # (m, 4) re-centring polynomials c0, c1, c0', c1' for hip and knee with a guide; row: cycle
     reach: Vector  # (2,) rad/s, speeds of sagittal hip and knee of the swing leg that move a late swing foot down
     lowering: float  # m/s, downward speed of a late swing foot that results from the joint speeds `reach`
-    #: Hip and knee move with the speeds `reach` for this number of cycles after the end of the table.
-    #: The number `reach_cycles` is chosen so that the knee does not become straighter than `Reach.knee`.
+    #: Number of cycles after the end of the table in which hip and knee move with the speeds `reach`.
+    #: Within these cycles, the knee does not become straighter than `Reach.knee`.
     reach_cycles: int
-    #: After a push, foot placement lowers a late swing foot for this number of cycles after the end of the table.
-    #: Unlike `reach_cycles`, the number `lowering_cycles` does not depend on the knee angle.
+    #: Number of cycles after the end of the table in which foot placement lowers a late swing foot after a push.
+    #: Unlike `reach_cycles`, `lowering_cycles` does not depend on the knee angle.
     lowering_cycles: int
 
 
@@ -155,7 +155,7 @@ def _product(a: Vector, b: Vector) -> Vector:
 
 
 def _reach(q: Vector, swing: int, kinematics: Kinematics, upright: Vector) -> Vector:
-    """Return how far hip and knee must turn to move the swing foot straight down, per metre, shape (2,) [rad/m]."""
+    """Return the angles of hip and knee per metre of vertical downward motion of the swing foot, shape (2,) [rad/m]."""
     columns = []
     for joint in (_SH, _SK):
         rate = np.zeros(len(q))

@@ -37,7 +37,8 @@ Pair = tuple[float, float]
 
 _N = len(JOINTS)
 #: Number of steps without a virtual guide after a change of the gait: one step with each leg.
-#: A guide is certified only for steps that start near the gait. The first step of each leg starts too far from the new gait.
+#: A guide is certified only for steps that start near the gait. After the change, the first step of each leg starts too far
+#: from the new gait.
 _JOINING = 2
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
@@ -45,8 +46,8 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 class Section(NamedTuple):
     """Section of a walk: a number of periodic steps with one gait."""
 
-    #: Periodic step, start step and stop step. Only the section in which the walk begins uses its start step.
-    #: Only the section in which the walk ends uses its stop step.
+    #: Periodic step, start step and stop step. The start step is used only in the section in which the walk begins.
+    #: The stop step is used only in the section in which the walk ends.
     gaits: WalkGaits
     steps: int  # number of periodic steps
 
