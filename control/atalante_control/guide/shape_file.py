@@ -70,7 +70,7 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
     name, summary = document["name"], document.get("summary", "")
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
         raise ValueError(
-            f"name must start with a lower-case letter, followed by at most 31 of a-z, 0-9, - and _, got {name!r}"
+            f"name must start with a lower-case letter, and have at most 32 characters (a-z, 0-9, - and _), got {name!r}"
         )
     if name in SHAPES:
         raise ValueError(

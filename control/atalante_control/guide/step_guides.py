@@ -27,7 +27,7 @@ from atalante_hal.types import PERIOD, Vector
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
-#: If the requested torques cannot be certified, a filter assumes this fraction of the largest certifiable disturbance torques.
+#: Assumed disturbance torques as a fraction of the largest certifiable torques, if the requested torques cannot be certified.
 #: With the fraction 1, a prediction would reach its limit without a push, so the filter would apply the full backup torque.
 _MARGIN = 0.95
 #: Number of intervals between the assistance factors 0 and 1. A filter is chosen for each of the factors 0, 0.01, ..., 1.

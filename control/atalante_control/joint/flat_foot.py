@@ -83,7 +83,7 @@ class FlatFoot:
 
 
 class Tibiae:
-    """Substitute for a lost tibia IMU: computes attitude and angular velocity of the tibia from the joints and the pelvis IMU."""
+    """Substitute for a lost tibia IMU. It computes attitude and angular velocity from the joints and the pelvis IMU."""
 
     def __init__(self, articulated: ArticulatedModel) -> None:
         """Prepare the forward kinematics.

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-#: N, largest twist (forces FL - FR - RL + RR on the four cells of a foot) that noise causes if all four cells are correct
+#: Largest absolute twist that noise causes if all four cells of a foot are correct [N].
+#: The twist is FL - FR - RL + RR, where FL, FR, RL and RR are the vertical forces on the cells.
 _LARGEST_TWIST = 60.0
 
 

@@ -39,7 +39,7 @@ class LeanConfig(NamedTuple):
     rise: float = 14.0  # rad/s, natural frequency of the lean motion (critically damped) while the trunk leans further
     fall: float = 5.0  # rad/s, natural frequency of the lean motion (critically damped) while the trunk returns
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
-    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per metre of DCM position beyond `leg_zone`; 0: no shift
+    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per metre of DCM beyond `leg_zone`; 0: no shift
     #: m, sideways position of the DCM above which the swing foot moves outwards.
     #: The DCM position is relative to the middle of the stance sole, and positive away from the swing foot.
     leg_zone: float = 0.02

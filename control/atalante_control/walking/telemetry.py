@@ -40,8 +40,9 @@ class Telemetry:
     elapsed: float  # s, time since the start of the phase
     max_dcm_error: float  # m, largest error of the DCM in the steps so far
     assistance_factor: float  # assistance factor: 0 (widest guide) to 1 (no guide); 1 in every phase without a guide
-    # The controller reads the fields from `error` to `gate` as one vector.
-    error: Annotated[Vector, 2]  # rad, q - q_des of sagittal hip and knee in the last cycle with a guide (swing leg)
+    # The controller reads the fields from `error` to `gate` as one vector. Without a guide, and after a guide that ended early,
+    # `h` is 1, and the other three fields are 0. After the nominal end of a guided step, the last values are kept.
+    error: Annotated[Vector, 2]  # rad, q - q_des of sagittal hip and knee of the swing leg
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the bound of the guide on the side of `error`
     h: float  # safety value h of the paper: at least 0 if the backup policy can keep both joints inside the guide
     gate: float  # weight of the backup torque, 0 (free motion) to 1 (full backup torque); published as `lambda`
