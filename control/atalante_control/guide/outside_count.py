@@ -1,4 +1,4 @@
-"""Counter with a limit, which detects that the safety value h is negative in too many cycles."""
+"""Counter of the cycles with a negative safety value h. The counter has a limit."""
 
 from __future__ import annotations
 

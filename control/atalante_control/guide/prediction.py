@@ -216,7 +216,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _for_rate_difference(rows: Vector) -> Vector:
-    """Convert prediction matrices to a state with the differences of the error rates (true minus measured) in elements 2 and 3.
+    """Convert prediction matrices: elements 2 and 3 of their state become the error rates, true minus measured.
 
     The given matrices multiply a state in which elements 2 and 3 are the true error rates of SH and SK. Elements 4 and 5 are the
     measured error rates. The returned matrices multiply a state in which elements 2 and 3 are the differences true - measured.

@@ -25,7 +25,7 @@ STEERING = 0.5, 0.15, math.radians(3.0)
 _NO_INTEGRAL = (0.0,) * 6
 #: Largest absolute value of `WalkConfig.turn` (rotation of the walking direction before each periodic step) [rad].
 #: With a turn of 5 degrees, a passive patient of 91 kg and 1.93 m fell in guided steps at assistance factor 0.
-#: With an active patient of 91 kg and 1.93 m, the largest DCM error was 0.15 m at 3 degrees, and 0.19 m at 4 degrees.
+#: With an active patient of 91 kg and 1.93 m, the largest DCM error was 0.15 m at a turn of 3 degrees, and 0.19 m at 4 degrees.
 TURN_MAX = math.radians(3.0)
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
 #: The PIDs act against the ankle stabiliser, so the integral terms of the two legs drifted apart.
@@ -55,7 +55,7 @@ class WalkConfig:
 
     gains: PidGains = WALK_GAINS
     #: Fraction by which each cycle of delay (`State.delay`) reduces the derivative gains of the stance leg (SH, SK, SA).
-    #: With a delay of d cycles, the gains are multiplied by 1 - damping_loss * d. Example: the default gives 0.75 for d = 3.
+    #: With a delay of d cycles, the gains are multiplied by 1 - damping_loss * d. Example: by 0.75 with the default and d = 3.
     #: With full gains and a delay of 3 cycles, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)

@@ -65,7 +65,7 @@ _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _TH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("TH", "SH", "SK"))
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
 _TIBIAE = [IMUS.index(f"{side}_tibia") for side in FEET]
-#: Smallest distance from a joint angle that lean or foot placement requests to the position limit [rad].
+#: Smallest distance between the position limit and a joint angle requested by lean or foot placement [rad].
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 SENSOR_AGE = 10

@@ -67,7 +67,7 @@ class PlacementConfig(NamedTuple):
     inward: float = 0.02  # m, largest shift of the landing position towards the stance foot
     slowest: float = 0.1  # smallest phase rate; the phase rate is the speed of the step relative to the gait
     fastest: float = 1.6  # largest phase rate
-    #: s, time from the start of a step until the DCM error is used. Before, the new stance foot is not yet at rest.
+    #: s, time from the start of a step until the DCM error is used. Until then, the new stance foot is not yet at rest.
     settled: float = 0.08
     #: s, duration of the last part of a step, up to the nominal landing. In this part, the phase rate returns to 1.
     #: In the last part of a step, the landing offset follows from the present DCM error, not from a prediction (`late_landing`).

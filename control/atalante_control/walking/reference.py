@@ -50,7 +50,7 @@ class PhaseTable(NamedTuple):
     reach: Vector  # (2,) rad/s, speeds of sagittal hip and knee of the swing leg that move a late swing foot down
     lowering: float  # m/s, downward speed of a late swing foot that results from the joint speeds `reach`
     #: Number of cycles after the end of the table in which hip and knee move with the speeds `reach`.
-    #: Within these cycles, the knee does not become straighter than `Reach.knee`.
+    #: In these cycles, the desired knee angle does not fall below `Reach.knee`.
     reach_cycles: int
     #: Number of cycles after the end of the table in which foot placement lowers a late swing foot after a push.
     #: Unlike `reach_cycles`, `lowering_cycles` does not depend on the knee angle.

@@ -48,7 +48,7 @@ class Telemetry:
     gate: float  # weight of the backup torque, 0 (free motion) to 1 (full backup torque); published as `lambda`
 
 
-#: s, time from the start of a step until `max_dcm_error` includes the DCM error. Before, the landed foot is not yet at rest.
+#: s, time from the start of a step until `max_dcm_error` includes the DCM error. Until then, the landed foot is not at rest.
 _SETTLED = 0.1
 _DTYPE = dtype_of(Telemetry)
 #: Name and number of values of each published field, in the order of the record.
