@@ -100,7 +100,7 @@ def _cached(file: Path, key: bytes) -> Network | None:
 
 
 def _store(file: Path, key: bytes, network: Network) -> None:
-    """Write a cache file. If the folder is not writable, the DBC is parsed at each start.
+    """Write a cache file. Do nothing if the folder is not writable: the DBC is then parsed at each start.
 
     Args:
         file: Cache file. Another process may read or write it at the same time.

@@ -9,20 +9,20 @@ from typing import TypeVar
 
 #: Payload lengths that CAN FD supports (ISO 11898-1) [byte].
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-#: Largest signal length [bit]. The codec rounds integers of at most this length exactly.
+#: Largest signal length [bit]. The rounding of the codec is exact for integers of at most `LONGEST_SIGNAL` bits.
 LONGEST_SIGNAL = 51
-#: Signals of the E2E Profile 5 header at the start of a payload: start bit and number of bits.
+#: E2E Profile 5 header at the start of a payload: name of each signal -> (start bit, number of bits).
 E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 
 
 class DbcError(ValueError):
-    """Error of an invalid DBC. Each line of the error text states one problem with its line number in the file."""
+    """Error of an invalid DBC. Each line of the error text states a problem and its line number in the DBC."""
 
     code = "DBC_INVALID"
 
 
 def decoded_text(content: bytes, errors: str = "strict") -> str:
-    """Return the text of a DBC file in UTF-8, with or without byte order mark. Any other text is decoded as Windows-1252.
+    """Decode a DBC file as UTF-8, or as Windows-1252 if its bytes are not valid UTF-8. Remove a byte order mark.
 
     Args:
         content: bytes of the file.
@@ -63,9 +63,9 @@ class Message:
     signals: tuple[Signal, ...]
     bus: str
     send_type: str  # "cyclic" or "event"
-    cycle_ms: int  # ms, period of a cyclic message; 0 for an event message
-    timeout_ms: int  # ms, timeout of the message at its receivers; 0 if the message has no timeout
-    inhibit_ms: int  # ms, minimum time between two frames of an event message
+    cycle_ms: int  # period of a cyclic message [ms]; 0 for an event message
+    timeout_ms: int  # timeout of the message at its receivers [ms]; 0 if the message has no timeout
+    inhibit_ms: int  # minimum time between two frames of an event message [ms]
     data_id: int  # AUTOSAR E2E Data ID
     comment: str
 

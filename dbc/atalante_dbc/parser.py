@@ -122,7 +122,10 @@ def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
 
 
 def _sender_problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Yield each message that is not on the bus of most messages of its node. Only the master may send on several buses."""
+    """Yield each message that a node sends on an unexpected bus. The expected bus carries most messages of the node.
+
+    Only the master may send on several buses.
+    """
     masters = {node.name for node in database.nodes if _attribute(node, "NodeKind") == "master"}
     sent: dict[str, list[RawMessage]] = {}
     for message in database.messages:

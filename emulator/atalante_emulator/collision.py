@@ -14,7 +14,7 @@ from atalante_hal.wire.frame import Frames
 
 
 class Senders:
-    """Detector of a message that two nodes send.
+    """Detect whether two nodes send the same message.
 
     The emulator runs the detector only in cycles with missing, rejected, late or extra frames.
     """
@@ -45,7 +45,7 @@ class Senders:
 
 
 def intact_payloads(message: Message, frames: Frames) -> list[bytes]:
-    """Return the payloads of all frames of a message with correct length and CRC.
+    """Return the payload of each frame of a message, if length and CRC of the frame are correct.
 
     Args:
         message: message of the DBC.

@@ -18,7 +18,7 @@ from atalante_hal.types import GRAVITY, PERIOD, SupervisorState, Vector
 
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
-#: The crane lowers the robot when the HAL has been in the states ACTIVE and FULL_ASSIST for this total time [s].
+#: Total time of the HAL in the states ACTIVE and FULL_ASSIST after which the crane lowers the robot [s].
 #: Before the robot is lowered, the walking controller moves the legs of the suspended robot to the standing pose.
 #: On the floor, the friction of the feet would prevent the motion of the legs to the standing pose.
 DELAY: Final = 2.0
@@ -30,7 +30,7 @@ DAMPING: Final = 28.0  # N s/m per kg
 #: The crane multiplies the moment on the pelvis by the fraction of the robot weight that the sling carries.
 RIGHTING: Final = 100.0  # Nm/rad per kg
 ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg
-#: The crane lowers the hook until the sling has this slack [m]. Then the crane exerts no force until a call of `lift`.
+#: Slack of the sling at which the crane stops the hook [m]. Then the crane exerts no force until a call of `lift`.
 #: The pelvis of a walking robot moves up and down by less than `SLACK`, so the sling stays loose.
 SLACK: Final = 0.15
 _ACTIVE: Final = (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST)

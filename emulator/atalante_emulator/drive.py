@@ -49,15 +49,15 @@ class DriveParameters:
     motor: MotorParameters = field(default_factory=MotorParameters)
     velocity_bandwidth: float = 80.0  # cut-off frequency of the velocity low-pass [Hz]
     torque_noise: float = 0.05  # noise of the torque measurement [Nm rms]
-    trip_temperature: float = 120.0  # a drive switches its power stage off at this winding temperature [degC]
-    #: The HAL can acknowledge an over-temperature error at this winding temperature or below [degC].
+    trip_temperature: float = 120.0  # winding temperature at which a drive switches its power stage off [degC]
+    #: Highest winding temperature at which the HAL can acknowledge an over-temperature error [degC].
     cool_enough: float = 100.0
     supply: float = 48.0  # nominal supply voltage [V]
-    hold_below: float = 40.0  # below this supply voltage [V], a drive stops following commands and holds its joint
-    #: If two successive encoder samples show a joint speed above this value [rad/s], a holding drive assumes an encoder jump.
+    hold_below: float = 40.0  # supply voltage below which a drive holds its joint instead of following commands [V]
+    #: Joint speed, computed from two successive encoder samples, above which a holding drive assumes an encoder jump [rad/s].
     jump_speed: float = 20.0
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
-    rest_speed: float = 0.05  # in FAULT REACTION ACTIVE, a joint counts as stopped below this joint speed [rad/s]
+    rest_speed: float = 0.05  # joint speed below which a joint counts as stopped in FAULT REACTION ACTIVE [rad/s]
 
 
 class DriveSignals(NamedTuple):
@@ -206,7 +206,7 @@ class Drives:
         np.multiply(generator.standard_normal(out.shape), self.parameters.torque_noise, out=out)
 
     def _without_command(self, wanted: Vector) -> None:
-        """Overwrite the torque of each drive that does not follow commands.
+        """Overwrite the torque of each drive that is not in OPERATION ENABLED.
 
         A drive in QUICK STOP ACTIVE holds its joint with a spring and damper torque. A drive in OPERATION ENABLED keeps its
         commanded torque. A drive in any other state has zero torque.
@@ -215,12 +215,12 @@ class Drives:
         # Use the encoder velocity without low-pass: the delay of a low-pass would reduce the damping of the hold.
         speed = self.encoders.speed
         jumped = np.abs(speed) > self.parameters.jump_speed
-        # A joint speed above `jump_speed` means that the encoder position jumped, not the joint.
+        # A joint speed above `jump_speed` means that only the encoder position jumped. The joint did not jump.
         # Shift the hold position by the jump of the encoder position, so that the hold torque does not change.
         if jumped.any():
             self._hold_at[jumped] += speed[jumped] * PERIOD
             speed[jumped] = 0.0
-        # Set new hold positions only after this shift: they are measured positions, which already contain the jump.
+        # Set new hold positions only after the shift, because a new hold position already contains the jump.
         begins = np.isnan(self._hold_at)
         if begins.any():
             self._hold_at[begins] = self.encoders.angle[begins]
@@ -436,7 +436,7 @@ class Drives:
                 self.recover(drive, emergency.OVER_TEMPERATURE)
 
     def _check_rest(self) -> None:
-        """Put each drive with a stopped joint from FAULT REACTION ACTIVE into FAULT."""
+        """Change the state of each drive in FAULT REACTION ACTIVE to FAULT if its joint has stopped."""
         speed = np.abs(self.encoders.speed)
         for drive in np.flatnonzero(speed < self.parameters.rest_speed).tolist():
             if self.state[drive] is DriveState.FAULT_REACTION_ACTIVE:

@@ -130,7 +130,7 @@ class Errors:
             self._report(node, ERROR_RESET)
 
     def any_persists(self, node: int) -> bool:
-        """Return whether a node has an error whose cause still exists.
+        """Return whether the cause of at least one error of a node still exists.
 
         Args:
             node: index of the node.
@@ -138,7 +138,7 @@ class Errors:
         return any(self._active[node].values())
 
     def has(self, node: int, code: int) -> bool:
-        """Return whether a node has an active error with the given code and with a cause that still exists.
+        """Return whether the error with the given code is active in a node and the cause of the error still exists.
 
         Args:
             node: index of the node.

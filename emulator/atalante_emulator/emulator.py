@@ -50,9 +50,9 @@ _RECEIVE_BUDGET = 128
 _BATCH = 128
 #: The nodes reject a command frame if `ReceiveImage` found one of these errors in the frame.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
-#: Half of the 256 values of the alive counter. Differences of two alive counters are mapped to the range -128 to 127.
+#: Half of the number of alive counter values (256). The difference of two alive counters is mapped to -128 to 127.
 _HALF_TURN = 128
-#: The HAL sends one SYNC on each bus. After the first SYNC, the emulator waits at most this time for all other SYNCs [s].
+#: Longest wait for the other SYNCs of a cycle after the first SYNC [s]. The HAL sends one SYNC on each bus.
 _SYNC_SKEW = 200e-6
 #: Largest number of cycles without SYNC that `run` simulates in a row to catch up with real time.
 #: After these cycles, `run` calls `stop` and receives frames.
@@ -117,9 +117,9 @@ class Emulator:
         self.before_send: list[Callable[[int, Vector], None]] = []
         self.pelvis_forces: list[Callable[[int], Vector]] = []
         self._pushing = False  # whether a wrench acted on the pelvis in the last time step
-        #: Crane that lowers the robot to the ground, or None. If set, the crane is also in the list `pelvis_forces`.
+        #: Crane that lowers the robot to the ground, or None. If set, the crane is also in `pelvis_forces`.
         self.crane: Crane | None = None
-        #: Emulated operator who steadies the robot on the ground, or None. If set, it is also in the list `pelvis_forces`.
+        #: Emulated operator who steadies the robot on the ground, or None. If set, the operator is also in `pelvis_forces`.
         self.virtual_operator: VirtualOperator | None = None
         #: Emulated wearer whose legs act on the joints of the robot, or None.
         self.wearer: PassiveWearer | ActivePatient | None = None
@@ -151,7 +151,7 @@ class Emulator:
 
     @property
     def signals(self) -> Codec:
-        """Codec of the 1 ms messages of the nodes. Its signal indices apply to `values` in a `before_send` callable."""
+        """Codec of the 1 ms messages of the nodes. Its method `index` finds a signal in the `values` of `before_send`."""
         return self._tx.codec
 
     # -- construction ------------------------------------------------------------------------------------------------
@@ -314,7 +314,10 @@ class Emulator:
 
     @property
     def _lost_sync(self) -> bool:
-        """Whether the HAL sent a SYNC in this call of `poll`. Also True if an injected fault removed the SYNC."""
+        """Whether the HAL sent a SYNC in this call of `poll`, even if an injected fault removed the SYNC.
+
+        Always False for an emulator without communication faults.
+        """
         return self._link is not None and self._link.synced
 
     def _imperfect_cycle(self, count: int) -> bool:

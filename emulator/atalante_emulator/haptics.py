@@ -14,9 +14,9 @@ WATCHDOG = 10
 
 @dataclass(frozen=True)
 class HapticsParameters:
-    """Speed at which the emulated vibration motors follow their commanded level."""
+    """Response time of the emulated vibration motors."""
 
-    #: Time constant of a small eccentric-mass motor [s]. After this time, the motor has made 63 % of a change of the level.
+    #: Time constant of a small eccentric-mass motor [s]. After one time constant, the motor has made 63 % of a change of level.
     rise_time: float = 0.04
 
 

@@ -31,7 +31,7 @@ class ImuParameters:
     accel_bias: float = 0.02  # standard deviation of the accelerometer bias [m/s2]
     attitude_error: float = 0.0  # random error of the reported attitude about each world axis [rad rms]
     attitude_time: float = 10.0  # time constant with which the random attitude error changes [s]
-    heading_drift: float = 0.0  # standard deviation of the speed at which the heading error of an IMU grows [rad/s]
+    heading_drift: float = 0.0  # standard deviation of the heading drift rate of an IMU [rad/s]
     temperature: float = 32.0  # constant temperature of all IMUs [degC]
 
 
@@ -81,7 +81,7 @@ class AttitudeError:
     """
 
     def __init__(self, parameters: ImuParameters, count: int, interval: float, generator: np.random.Generator) -> None:
-        """Draw the initial attitude error of each IMU, and the speed at which its heading drifts.
+        """Draw the initial attitude error and the heading drift rate of each IMU.
 
         The drift starts at zero.
 

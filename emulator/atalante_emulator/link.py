@@ -42,15 +42,15 @@ class _Disturbance:
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # A fault of kind `inject` sends copies of the last real frame. To have a real frame at its start, the fault receives
-        # frames from the previous cycle on.
+        # A fault of kind `inject` sends copies of the last real frame. The fault needs such a frame in its first cycle,
+        # so it records real frames from one cycle earlier.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
         self.late: list[_Late] = []
         self._network = network
         self._counters: dict[int, int] = {}  # for kind `freeze_counter`: frame identifier -> frozen alive counter
-        self._held: dict[int, Frames] = {}  # for kind `reorder`: frame identifier -> frame to send after the next frame
+        self._held: dict[int, Frames] = {}  # for kind `reorder`: frame identifier -> held frame, sent after the next frame
         self._last: Frames | None = None  # for kind `inject`: last real frame of the target message
         self._effect = _EFFECTS[fault.kind]
         self.babble: Babble | None = None
@@ -240,7 +240,7 @@ class FaultyBus(WrappedBus):
             FaultError: If the target or a signal of a fault is not in the network.
         """
         super().__init__(bus)
-        #: Whether the HAL has sent a SYNC since the emulator last set this value to False.
+        #: Whether the HAL sent a SYNC in the current call of `Emulator.poll`. Each call first sets `synced` to False.
         #: A SYNC also counts if an injected fault removed it, so that no node received it.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
@@ -254,7 +254,7 @@ class FaultyBus(WrappedBus):
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._from_hal = {m.frame_id for m in network.sent_by("HAL")}
         self._for_nodes: list[Frames] = []  # frames that the next `receive` returns to the nodes
-        #: Model of the bus time: during a fault `flood`, it decides which frames are sent in a cycle and which must wait.
+        #: Model of the arbitration: selects the frames that are sent in a cycle during a fault `flood`. All other frames wait.
         self.wire = Wire(network)
 
     def send(self, frames: Frames) -> None:
@@ -317,7 +317,7 @@ class FaultyBus(WrappedBus):
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
         """Apply all active faults to each frame. Return the frames that are sent in this cycle."""
         passing: list[Frames] = []
-        unchanged = 0  # index of the first frame that is not yet handled; frames from here to `row - 1` have no fault
+        unchanged = 0  # index of the first frame not yet in `passing`; no fault changed the frames from here to `row - 1`
         for row, can_id in enumerate(frames["can_id"].tolist()):
             acting = self._acting.get(can_id, ())
             for number, disturbance in enumerate(acting, 1):
@@ -360,7 +360,7 @@ class FaultyBus(WrappedBus):
                 channel.send(joined(frames))
 
     def _channel(self, bus: str) -> Bus:
-        """Return the channel on which added frames of a bus are sent.
+        """Return the channel for the frames that faults add to a bus.
 
         A `JoinedBus` selects a channel by the frame identifier, but an added frame may have any identifier.
         """

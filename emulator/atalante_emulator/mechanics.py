@@ -22,7 +22,7 @@ from atalante_hal.robot import JOINTS
 #: Parameters of the nodes if the robot stands on the ground.
 #: The IMUs have attitude errors, because a walking controller must tolerate such errors.
 GROUND_PARAMETERS: Final = EmulatorParameters(imu=ImuParameters(attitude_error=0.004, heading_drift=5.2e-5))
-#: Like `GROUND_PARAMETERS`, but each IMU also measures its heading, for example by a magnetometer. So no heading drifts.
+#: Like `GROUND_PARAMETERS`, but without heading drift: each IMU also measures its heading, for example by a magnetometer.
 HEADING_REFERENCE_PARAMETERS: Final = replace(GROUND_PARAMETERS, imu=replace(GROUND_PARAMETERS.imu, heading_drift=0.0))
 
 
@@ -42,14 +42,14 @@ class Mechanics:
     urdf: str  # text of the URDF; if a person wears the robot, the URDF also contains the body of the person
     engine: str = ENGINES[0]  # physics engine, one of `ENGINES`
     ground: Ground | None = None  # floor below a robot with a free pelvis; None: no floor and a fixed pelvis
-    #: Stiffness and damping of the wearer's passive legs. With None, a wearer in the URDF acts on the joints only by mass.
+    #: Impedance of the wearer's relaxed legs. None: the default impedance if `active` is set, otherwise no impedance.
     limbs: LimbParameters | None = None
     active: ActiveTask | None = None  # task of a wearer who moves the legs by muscle; None: the wearer uses no muscles
     parameters: EmulatorParameters | None = None  # parameters of the nodes; None: see `node_parameters`
 
     @property
     def node_parameters(self) -> EmulatorParameters:
-        """Return `parameters`. If they are None, return GROUND_PARAMETERS for a robot with a floor, otherwise the defaults."""
+        """Return `parameters` if set. Otherwise return GROUND_PARAMETERS if there is a floor, and the defaults if not."""
         return self.parameters or (GROUND_PARAMETERS if self.ground else EmulatorParameters())
 
     def make_body(self, pose: Sequence[float] | None = None) -> Body:

@@ -21,8 +21,9 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-#: Factors of the metabolic rate M [J/l]: M = OXYGEN * oxygen uptake + CARBON_DIOXIDE * carbon dioxide output, both in l/s.
-#: Brockway also subtracts the energy of the nitrogen in the urine, which is omitted here.
+#: Factors of oxygen uptake and carbon dioxide output in the equation of the metabolic rate [J/l]:
+#: metabolic rate [W] = OXYGEN * oxygen uptake [l/s] + CARBON_DIOXIDE * carbon dioxide output [l/s].
+#: Brockway also subtracts a term for the nitrogen in the urine. This term is omitted here.
 #: Source: Brockway, "Derivation of formulae used to calculate energy expenditure in man", Hum. Nutr. Clin. Nutr. 41C, 1987.
 OXYGEN: Final = 16_580.0
 CARBON_DIOXIDE: Final = 4_510.0
@@ -37,13 +38,14 @@ class MetabolismParameters:
     #: Metabolic rate of quiet standing [W/kg].
     #: Source: walking equation of Looney et al., Med. Sci. Sports Exerc. 51, 2019.
     standing: float = 1.44
-    #: Work done by a shortening muscle per metabolic energy. The muscle uses 4 J to do 1 J of work.
+    #: Work that a shortening muscle does, divided by the metabolic energy: the muscle uses 4 J to do 1 J of work.
     #: Source: Margaria, Int. Z. Angew. Physiol. 25, 1968.
     positive: float = 0.25
-    #: Work absorbed by a lengthening muscle per metabolic energy. The muscle uses 1 J to absorb 1.2 J (Margaria 1968).
+    #: Work that a lengthening muscle absorbs, divided by the metabolic energy: the muscle uses 1 J to absorb 1.2 J.
+    #: Source: Margaria 1968.
     negative: float = 1.20
     #: Metabolic rate of a muscle that holds a torque of 1 Nm without motion [W/Nm]: 0.054 * 10 rad/s.
-    #: The speed 10 rad/s is an assumption: the fastest possible motion of the joint.
+    #: The largest possible joint speed is assumed to be 10 rad/s.
     #: Source of 0.054: Minetti, Alexander, J. Theor. Biol. 186, 1997.
     activation: float = 0.54
     quotient: float = 0.85  # respiratory exchange ratio, litres of CO2 per litre of O2

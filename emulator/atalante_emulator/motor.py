@@ -25,12 +25,12 @@ class MotorParameters:
     current_loop: float = 0.5e-3  # time constant with which the motor torque follows the torque setpoint [s]
     dead_time: int = 0  # number of cycles until a new torque setpoint reaches the current loop
     ambient: float = 25.0  # ambient temperature [degC]
-    heating: float = 70.0  # steady temperature rise of the winding above `ambient` at half the torque limit [K]
+    heating: float = 70.0  # winding temperature minus `ambient` after a long time at half the torque limit [K]
     thermal_time: float = 300.0  # time constant of the winding temperature [s]
 
 
 _MOTORS = np.arange(len(JOINTS))
-#: Largest additional delay of a motor torque that a fault can cause [cycles], see `Motors.delay`.
+#: Largest delay that a fault can add to the torque setpoint of a motor [cycles], see `Motors.delay`.
 MOST_LATE = 20
 
 # Rows 0 to 3 of the motor array: torque setpoint, ratio of true torque to measured torque, dry friction, damping.
@@ -69,7 +69,7 @@ class Motors:
         self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
         #: Time until a new setpoint reaches the current loop of each motor [cycles].
         self._dead_time = np.full(len(JOINTS), parameters.dead_time)
-        #: Past setpoints, the newest in row `_cycle % len(_setpoints)`. Recorded only if a motor has or had a delay.
+        #: Past torque setpoints. Row `_cycle % len(_setpoints)` is the newest. Recorded only if a motor has or had a delay.
         self._setpoints = np.zeros((parameters.dead_time + MOST_LATE + 1, len(JOINTS)))
         self._records = parameters.dead_time > 0
         self._cycle = 0

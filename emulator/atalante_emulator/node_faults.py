@@ -246,7 +246,7 @@ class NodeFaults:
             values[self._codec.index(f"{node}_STATE", quantity + fault["axis"])] *= -1.0
 
     def _imu_turned(self, fault: Fault, node: str, values: Vector) -> None:
-        """Change the readings to those of a sensor that is turned in its mount."""
+        """Change the readings of an IMU as if the IMU were turned in its mount."""
         indices = self._measured(node)
         quaternion, gyro, accel = np.split(values[indices], [4, 7])
         angle, axis = math.radians(fault["degrees"]), np.eye(3)["XYZ".index(fault["axis"])]

@@ -17,7 +17,7 @@ NOISE_CYCLES: Final = 128
 
 
 class SensorNoise:
-    """Table of sensor noise: one row per cycle for `NOISE_CYCLES` cycles, one column per signal of the codec."""
+    """Table of sensor noise: `NOISE_CYCLES` rows (one per cycle), and one column per signal of the codec."""
 
     def __init__(self, seed: int, codec: Codec, drives: Drives, imus: Imus, feet: Feet) -> None:
         noise = np.zeros((NOISE_CYCLES, codec.size))

@@ -55,13 +55,13 @@ class ActiveParameters:
         ValueError: If a parameter is out of range.
     """
 
-    #: Feedback torque per perceived error [Nm/rad]: the stiffness of a person who resists a motion.
+    #: Feedback torque per perceived joint angle error [Nm/rad]: the stiffness of a person who resists a motion.
     gain: Pair = (150.0, 80.0)
     damping: Pair = (15.0, 8.0)  # feedback torque per rate of the joint angle error [Nm s/rad]
     #: Time from a joint angle error to the voluntary reaction [s]. Kinaesthetic reaction times are 0.12 to 0.18 s.
     delay: float = 0.15
-    #: Largest joint angle error that the patient does not perceive [rad].
-    #: The threshold at hip and knee is one to two degrees (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
+    #: Threshold of perception [rad]. The patient perceives only joint angle errors above `threshold`.
+    #: Measured thresholds at hip and knee are one to two degrees (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
     threshold: float = math.radians(1.0)
     #: Learning rate. Each step adds `learning` times `gain` times the perceived error to the learned torque of the leg.
     learning: float = 0.1
@@ -143,13 +143,13 @@ class ActivePatient:
         cycles = len(self._nominal)
         self._delay = round(parameters.delay / PERIOD)
         self._lag = PERIOD / (parameters.activation + PERIOD)
-        # In the following arrays, index k of the dimension `cycles` is cycle k of a step. The last dimension is hip, knee.
+        # Axes of the following arrays: `len(SIDES)` is the leg, `cycles` is the cycle of the step, 2 is hip and knee.
         self._learned = np.zeros((len(SIDES), cycles, 2))  # learned torque of each leg [Nm]
         self._plan = np.zeros((cycles, 2))  # learned torque of the current swing leg [Nm]
-        self._wobble = np.ones((cycles, 2))  # factor by which noise changes the wanted torque: 1 + noise, mean 1
-        #: Nominal minus true joint angle [rad], and the rate of this error [rad/s].
+        self._wobble = np.ones((cycles, 2))  # random factor on the wanted torque: 1 + noise, mean 1
+        #: Joint angle error (nominal minus true) [rad], and the rate of the error [rad/s].
         self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
-        #: Smallest joint angle error that the patient perceives, for each cycle [rad].
+        #: Threshold of perception of the joint angle error in each cycle [rad].
         #: The threshold of the hip angle is 0 while the patient feels a vibration motor of the thigh.
         #: The threshold of the knee angle is 0 while the patient feels a vibration motor of the shank.
         self._threshold = np.full((cycles, 2), parameters.threshold)
@@ -265,7 +265,7 @@ def _perceived(error: Vector, threshold: Vector) -> Vector:
 
 
 def _smooth(profile: Vector) -> Vector:
-    """Return the moving average of each column over 0.1 s, because a person cannot learn faster changes of torque."""
+    """Return the moving average of each column over 0.1 s. A person cannot learn torque changes that take less time."""
     window = round(0.1 / PERIOD)
     kernel = np.full(window, 1.0 / window)
     return np.column_stack([np.convolve(column, kernel, "same") for column in profile.T])

@@ -39,7 +39,7 @@ class Operator:
     In HOLD the emulated operator does not press START. Call `start()` to end HOLD.
     """
 
-    #: While the HAL is in READY, the operator presses START each time this number of cycles has passed.
+    #: Interval at which the operator presses START while the HAL is in READY [cycles]. The first press is after one interval.
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:

@@ -17,11 +17,11 @@ from atalante_hal.types import PERIOD, Vector
 
 _log = logging.getLogger(__name__)
 
-#: Largest lean of the pelvis at which the operator exerts no force [rad]. A walking robot leans less than that.
+#: Largest lean of the pelvis at which the operator exerts no force [rad]. A walking robot leans less than `DEADBAND`.
 DEADBAND: Final = 0.1
 STIFFNESS: Final = 2000.0  # force divided by (lean - `DEADBAND`) [N/rad]
 DAMPING: Final = 300.0  # force per lean rate [N s/rad]
-#: An intervention of the operator ends after this time without a force [cycles].
+#: Longest time from a cycle with a force to the next cycle with a force in the same intervention [cycles].
 _PAUSE: Final = 200
 
 
@@ -36,7 +36,7 @@ class Intervention:
 
 
 class VirtualOperator:
-    """Person who steadies the pelvis. Each call is one control cycle (1 ms) and returns force and moment on the pelvis."""
+    """Virtual person who steadies the pelvis. The emulator calls the operator once per control cycle (1 ms)."""
 
     def __init__(self, body: Body, most: float) -> None:
         """Connect the operator to a body.

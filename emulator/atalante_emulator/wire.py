@@ -17,7 +17,7 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
 
 
 class AddedFrame(NamedTuple):
-    """Frame that a fault adds, and the name of the bus on which it is sent."""
+    """Frame that a fault adds to a bus, and the name of the bus."""
 
     bus: str
     frame: Frames  # shape (1,)
@@ -32,7 +32,7 @@ class Babble:
     length: int  # payload length [bytes]
     load: float  # share of the bus time that the node tries to use, 0 to 1
     taken: float = 0.0  # wire time that the node takes in this cycle [s]
-    rest: float = 0.0  # wire time carried over to the next cycle, because it is shorter than one frame [s]
+    rest: float = 0.0  # wire time left over in this cycle, shorter than one frame, for use in the next cycle [s]
 
     def frames(self, network: Network) -> int:
         """Return how many flood frames fit into this cycle. Messages with smaller identifiers have priority over the flood.

@@ -15,7 +15,7 @@ from atalante_hal.compiled import specialised
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 from atalante_hal.types import GRAVITY, PERIOD, Vector
 
-#: MuJoCo's vector `qpos` starts with this number of elements for a free pelvis: position (3) and quaternion wxyz (4).
+#: Number of elements at the start of MuJoCo's vector `qpos` for the pose of a free pelvis: position (3), quaternion wxyz (4).
 _FREE: Final = 7
 #: Time at which a simulation starts [s]. If a simulation diverges, MuJoCo resets the simulation and sets its time to 0.
 #: So a simulation time below `_START` shows that the simulation has diverged.
@@ -35,7 +35,7 @@ class Contact(NamedTuple):
     #: Hardness of the contact at first touch, and hardness after the shapes have sunk deep into each other.
     #: Each value is between 0 (soft) and 1 (rigid). MuJoCo's name for this hardness is "impedance".
     solimp: tuple[float, float] = (0.99, 0.99)
-    impratio: float = 1.0  # contact hardness against sliding, divided by contact hardness against sinking in
+    impratio: float = 1.0  # ratio of two contact hardnesses: against sliding / against sinking in
 
 
 class _Sensed(NamedTuple):

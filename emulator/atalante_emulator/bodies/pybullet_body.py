@@ -20,7 +20,7 @@ from atalante_hal.types import GRAVITY, PERIOD, Vector
 
 #: Number of PyBullet solver iterations in each time step. Another number changes the computed motion.
 SOLVER_ITERATIONS = 50
-#: `pybullet.getLinkStates` returns a tuple for each link, with attitude, velocity and angular velocity at these indices.
+#: Indices of attitude, velocity and angular velocity in the tuple that `pybullet.getLinkStates` returns for each link.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
 _BASE: Final = -1  # link index of the root link in PyBullet
 #: Number of elements in a row of contact data: pad index (1), normal vector (3), normal force (1), two friction forces (4 each).
@@ -158,8 +158,9 @@ class PyBulletBody:
             pybullet.changeDynamics(self._body, pad, lateralFriction=friction, **client)
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # The first argument 1 requests velocities. The second argument 1 requests link poses at the current joint positions.
-        # With 0 as the second argument, `getLinkStates` would return the link poses of the previous time step.
+        # The third argument (computeLinkVelocity) is 1, to get the link velocities.
+        # The fourth argument (computeForwardKinematics) is 1, to get the link poses at the current joint positions.
+        # With 0 as the fourth argument, `getLinkStates` would return the link poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:

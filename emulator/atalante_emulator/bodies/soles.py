@@ -104,7 +104,7 @@ def total_mass(urdf: str) -> float:
 
 
 def into_frame(attitude: Vector | Quaternion, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return the components of a vector in a rotated frame, from its components in world axes.
+    """Convert a vector from world axes to the axes of a rotated frame.
 
     Numba-compiled functions call this function.
 
@@ -141,8 +141,8 @@ def _plate(cell: Vector, corner: Vector) -> Vector:
     matrix = np.zeros((len(cell), 3, len(corner), 3))
     share = 1.0 / len(cell)
     matrix[:, 2, :, 2] = share + np.outer(a, x) / (a @ a) + np.outer(b, y) / (b @ b)
-    # A horizontal force (F_x, F_y) on the corner (x, y) twists the plate with the yaw moment x F_y - y F_x about its centre.
-    # Each cell resists the twist by a horizontal force. The force is proportional to the distance of the cell from the centre.
+    # A horizontal force (F_x, F_y) on the corner (x, y) exerts the yaw moment x F_y - y F_x about the centre of the plate.
+    # Each cell resists the moment by a horizontal force. The force is proportional to the distance of the cell from the centre.
     polar = a @ a + b @ b
     matrix[:, 0, :, 0] = share + np.outer(b, y) / polar
     matrix[:, 0, :, 1] = -np.outer(b, x) / polar
