@@ -26,14 +26,15 @@ if not DESCRIPTORS.is_file():
     parser.error(f"the program must be started in the root of the project, got {Path.cwd()} without {DESCRIPTORS}")
 settings = {
     "mode": "client",
-    # A timeout of -1 means no timeout. Without `retry`, Zenoh would wait up to 4 s between two attempts.
+    # With timeout_ms = -1, Zenoh tries to connect without a time limit.
+    # Without `retry`, Zenoh would wait up to 4 s between two attempts.
     "connect": {
         "endpoints": [endpoint],
         "timeout_ms": -1,
         "retry": {"period_init_ms": 100, "period_max_ms": 200},
     },
     "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},  # connect to the endpoint only
-    "transport": {"shared_memory": {"enabled": False}},  # off, because Ctrl-C would leave shared memory in /dev/shm
+    "transport": {"shared_memory": {"enabled": False}},  # disabled, because Ctrl-C would leave files in /dev/shm
 }
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program, also while `zenoh.open` waits

@@ -11,7 +11,7 @@ from atalante_tools.bench.measure import Effort, Measurement
 from atalante_tools.console.options import MUJOCO, PYBULLET
 
 _UNITS: Final = {"us": 1e6, "s": 1.0}
-#: Number of processes that run a benchmark, if its result depends on the memory layout of the process.
+#: Number of processes for a benchmark whose result depends on the memory layout of the process.
 _REPEATED: Final = 7
 
 

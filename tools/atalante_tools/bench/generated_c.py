@@ -77,15 +77,15 @@ class GeneratedC:
 
     @property
     def inside(self) -> bool:
-        """Return whether all signals in the last call were inside their DBC ranges."""
+        """Return whether the last call found all signals inside their DBC ranges."""
         return self._inside.value
 
     def decode(self, frames: Frames, out: Vector, repetitions: int) -> float:
-        """Decode all frames into `out`. Decode `repetitions` times, and return the mean time of one decoding [s]."""
+        """Decode all frames into `out`, `repetitions` times. Return the mean time to decode all frames once [s]."""
         return _seconds(self._decode, frames, out, repetitions)
 
     def encode(self, values: Vector, frames: Frames, repetitions: int) -> float:
-        """Encode `values` into all frames. Encode `repetitions` times, and return the mean time of one encoding [s]."""
+        """Encode `values` into all frames, `repetitions` times. Return the mean time to encode all frames once [s]."""
         return _seconds(self._encode, frames, values, repetitions)
 
 

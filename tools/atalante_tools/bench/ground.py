@@ -25,7 +25,7 @@ _STEPS: Final = 40
 
 
 def ground_tick(effort: Effort) -> Measurement:
-    """Measure one simulation step of MuJoCo with eight contact points; the baseline is the same step of PyBullet."""
+    """Measure one simulation step of MuJoCo with eight contact points; the baseline is the same step in PyBullet."""
     urdf = describe(load_robot(), None, Patient(75.0, 1.75))
     blocks: dict[str, Block] = {}
     with ExitStack() as stack:

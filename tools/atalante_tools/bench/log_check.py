@@ -29,7 +29,7 @@ from atalante_tools.canlog.validate.project import Project
 _CYCLES, _QUICK_CYCLES = 2000, 300
 #: Number of copies of the recording in the log of a normal run, and in the log of a quick run.
 _REPEATED, _QUICK_REPEATED = 25, 2
-#: Number of frames that the baseline of python-can and cantools decodes per block; small, because this baseline is slow.
+#: Number of frames that the baseline of python-can and cantools decodes per block. It is small, because the baseline is slow.
 _SLICE = 30_000
 _MS = 1_000_000  # one millisecond [ns]
 _BEGIN = 1_700_000_000 * 1000 * _MS
@@ -135,7 +135,7 @@ def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
 
 
 class _Tap:
-    """Recorder that the HAL calls with every sent and every received frame: stores content, cycle and direction."""
+    """Recorder of all frames that the HAL sends and receives: stores content, cycle and direction of each frame."""
 
     def __init__(self) -> None:
         self.cycle = 0

@@ -14,9 +14,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-#: Number of blocks of the measured function in a normal run, large enough for a robust median. The baseline has as many blocks.
+#: Number of blocks of the measured function in a normal run, large enough for a robust median.
+#: The baseline has the same number of blocks.
 ROUNDS: Final = 200
-#: Number of blocks of the measured function with the option `--quick`. The baseline has as many blocks.
+#: Number of blocks of the measured function with the option `--quick`.
+#: The baseline has the same number of blocks.
 QUICK_ROUNDS: Final = 5
 
 #: Function that runs one block and returns the time per repetition [s].
@@ -38,7 +40,7 @@ class Measurement:
     value: float | None
     baseline: float | None
     remarks: tuple[str, ...] = ()
-    #: `ratio` of each process that ran the benchmark, in ascending order. Empty if the benchmark ran only in this process.
+    #: Values of `ratio` from all processes that ran the benchmark, in ascending order. Empty if it ran only in this process.
     ratios: tuple[float, ...] = ()
 
     @property

@@ -1,4 +1,4 @@
-"""Benchmarks of a controller part (the guide filter), the emulator, and the whole stack.
+"""Benchmarks of the guide filter, the emulator and the whole stack.
 
 The guide filter adds torques that keep hip and knee of the swing leg inside a virtual guide. In the benchmarks of emulator and
 stack, the robot is suspended or walks on the ground.
@@ -43,7 +43,7 @@ _BEFORE_WALKING: Final = 3000
 #: Number of cycles from power-on to the measurement of a robot on the ground.
 #: In the first `_BEFORE_STEPPING` cycles, the crane lowers the robot, and the robot shifts its weight.
 _BEFORE_STEPPING: Final = 8000
-#: While the robot walks, the upward axis of the pelvis must have at least this vertical component.
+#: Smallest accepted vertical component of the upward axis of the pelvis after a walk on the ground, 1 if upright.
 _UPRIGHT: Final = 0.95
 #: Number of cycles that are timed together as one block.
 _BLOCK: Final = 50

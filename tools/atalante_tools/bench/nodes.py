@@ -35,8 +35,9 @@ from atalante_tools.bench.measure import require
 
 #: Number of cycles after which an alive counter wraps to 0.
 TURN = 256
-#: Number of recorded poses, which are played in turn, one per cycle. The number has no common factor with 16.
-#: Some checks of the HAL run in every 16th cycle. With 16 poses, they would always read the same pose and report a fault.
+#: Number of recorded poses. The poses are played in turn, one per cycle. `POSES` has no common factor with 16.
+#: Some checks of the HAL run in every 16th cycle. With 16 poses, such a check would always read the same pose
+#: and report a fault.
 POSES = 15
 #: Largest constant tracking error (recorded minus desired joint angle) [rad].
 #: With tracking errors of at most `ERROR`, the guide filter does not saturate: its output is not at a limit.

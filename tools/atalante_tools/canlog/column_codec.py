@@ -72,7 +72,7 @@ class ColumnCodec:
         self._plan()
 
     def index(self, name: str) -> int:
-        """Return the index of a signal in `fields`, which is also the row of this signal in the result of `extract`.
+        """Return the index of a signal in `fields`. The result of `extract` has the signal in the row with the same index.
 
         Raises:
             KeyError: If the message has no such signal; the error lists the signals.
@@ -222,7 +222,7 @@ def raw_range(field: Field) -> range:
 
 
 def as_int64(code: int) -> int:
-    """Return the int64 with the same 64 bits as a raw code. Raw codes from 2**63 on become negative."""
+    """Return the int64 with the same 64 bits as a raw code. Raw codes of at least 2**63 become negative."""
     return code - (1 << 64) if code >= 1 << 63 else code
 
 
@@ -290,7 +290,7 @@ def crc_of_zeros(length: int, data_id: int) -> int:
 
 
 def crc_differences(frames: Frames, length: int) -> npt.NDArray[np.uint16]:
-    """Return a check value for each frame, which equals `crc_of_zeros` if the CRC of the frame is right. Shape (n,).
+    """Return the check value of each frame, shape (n,). It equals `crc_of_zeros` if the CRC of the frame is right.
 
     The check value is the received CRC, XORed with the contributions of all payload bytes to the CRC. The CRC is affine over
     GF(2), so a frame is intact if and only if the check value is `crc_of_zeros(length, data_id)`, with the Data ID of the

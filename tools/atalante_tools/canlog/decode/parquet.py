@@ -121,7 +121,7 @@ class ParquetSink:
         self._integers.clear()
 
     def _texts_of(self, field: Field, codes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32] | None:
-        """Return for each raw code the index of its name in `_texts`; -1 if the raw code has no name.
+        """Return the index in `_texts` of the name of each raw code; -1 if the raw code has no name.
 
         Returns:
             The indices, shape (n,); None if no raw code of the field has a name.
