@@ -50,7 +50,8 @@ class _Disturbance:
         self.late: list[_Late] = []
         self._network = network
         self._counters: dict[int, int] = {}  # for kind `freeze_counter`: frame identifier -> frozen alive counter
-        self._held: dict[int, Frames] = {}  # for kind `reorder`: frame identifier -> held frame, sent after the next frame
+        #: For kind `reorder`: frame identifier -> held frame, which is sent after the next frame of the message.
+        self._held: dict[int, Frames] = {}
         self._last: Frames | None = None  # for kind `inject`: last real frame of the target message
         self._effect = _EFFECTS[fault.kind]
         self.babble: Babble | None = None
@@ -317,7 +318,8 @@ class FaultyBus(WrappedBus):
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
         """Apply all active faults to each frame. Return the frames that are sent in this cycle."""
         passing: list[Frames] = []
-        unchanged = 0  # index of the first frame not yet in `passing`; no fault changed the frames from here to `row - 1`
+        # Index of the first frame that is not yet in `passing`. No fault changed the frames `unchanged` to `row - 1`.
+        unchanged = 0
         for row, can_id in enumerate(frames["can_id"].tolist()):
             acting = self._acting.get(can_id, ())
             for number, disturbance in enumerate(acting, 1):
