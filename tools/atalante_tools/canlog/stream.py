@@ -51,7 +51,7 @@ class Stream:
         return found
 
     def last(self, column: npt.NDArray[Any], carried: npt.NDArray[Any]) -> None:
-        """For each message in the chunk, copy the value of its last frame to `carried`.
+        """Copy the value of the last frame of each message in the chunk to `carried`.
 
         Args:
             column: value of each frame, shape (n,).

@@ -37,25 +37,25 @@ from atalante_tools.canlog.reader.chunk import MAX_CHANNELS, NO_DIRECTION, RECEI
 
 Text = npt.NDArray[np.uint8]
 
-#: Number of bytes that the parser may read after the text.
+#: Number of bytes that the memory must have after the end of the text, because the parser may also read these bytes.
 MARGIN = 1
-#: Minimum length of a text for the compiled function [byte]. Loading numba takes as long as parsing twice this length with the
-#: regular expression.
+#: Minimum length of a text [byte] for which the compiled function is used. To load numba takes as long as to parse
+#: 2 * `_COMPILED_BYTES` bytes with the regular expression.
 _COMPILED_BYTES = 1 << 20
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT, _R, _T = b"\n\r ()#.RT"
 _UPPER_CASE = 0xDF  # mask that changes a lower-case letter to upper case
 _NAME_BYTES = 16  # maximum length of a channel name in a line of the usual format; Linux allows 15
 _MAX_BYTES = 64  # maximum length of a payload
 _STANDARD = 0x7FF
-_STAMP_END = 1 << 63  # first time that does not fit into a stamp [ns], in the year 2262
-#: Maximum number of whole seconds in a line of the usual format. With any added fraction, the time fits into a stamp.
+_STAMP_END = 1 << 63  # smallest time [ns] that is too large for a stamp; it lies in the year 2262
+#: Maximum number of whole seconds in a line of the usual format. A stamp can hold `_MAX_SECONDS` plus any fraction of a second.
 _MAX_SECONDS = _STAMP_END // 10**9 - 1
 _NO_DIGIT = 0x1000
 #: Lookup table: ASCII code -> value of the hexadecimal digit (0 to 15), or `_NO_DIGIT` if the character is not such a digit.
 _DIGITS = np.full(256, _NO_DIGIT, np.int64)
 _DIGITS[np.frombuffer(b"0123456789abcdef", np.uint8)] = np.arange(16)
 _DIGITS[np.frombuffer(b"ABCDEF", np.uint8)] = np.arange(10, 16)
-#: A payload has at most `_MAX_BYTES` bytes. Without this limit, a damaged line of 8 MB would need 1.6 GB to match.
+#: A payload has at most `_MAX_BYTES` bytes. Without this limit, matching a damaged line of 8 MB would take 1.6 GB of memory.
 _LINE = re.compile(
     rb"\s*\((\d{1,10})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
     rb"(?:(#)([0-9A-Fa-f])((?:[0-9A-Fa-f]{2}){0,64})|([Rr])(\d?)|((?:[0-9A-Fa-f]{2}){0,64}))(?:_([9A-Fa-f]))?(?:\s+([RrTt]))?\s*"

@@ -12,7 +12,7 @@ from atalante_tools.canlog.reader.candump import MARGIN
 from atalante_tools.canlog.reader.chunk import Chunk, concatenated
 from atalante_tools.canlog.reader.log_file import LogFile
 
-#: Number of bytes of the log that one call of `candump.parse` parses, usually one chunk of frames.
+#: Maximum number of bytes that one call of `candump.parse` parses. These bytes usually contain the frames of one chunk.
 _TEXT_BYTES = 1 << 23
 
 
@@ -34,7 +34,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
             got, broken = _fill(file, memory[kept:_TEXT_BYTES])
             log.position = file.tell() if not log.compressed else log.position
             if not got:
-                break  # end of the file, or a read error; `broken` is the text of the read error
+                break  # end of the file or read error; `broken` is the error text, empty at the end of the file
             end = kept + got
             stop = text.rfind(b"\n", kept, end) + 1
             if not stop:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from atalante_tools.canlog.reader.chunk import Channels
 
-#: Suffix of a log format -> (format records the direction of frames, format records CAN FD flags, all bus errors are read).
-#: Some bus errors are not read: python-can skips the ER records of .trc and the CAN FD error objects of .blf.
+#: Suffix of a log format -> three truth values: the format records the direction of frames; the format records CAN FD flags;
+#: the reader reads all bus errors. Some bus errors are not read, because python-can skips the ER records of .trc and the
+#: CAN FD error objects of .blf.
 FORMATS = {
     ".log": (True, True, True),
     ".asc": (True, True, True),

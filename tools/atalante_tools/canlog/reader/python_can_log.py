@@ -203,7 +203,7 @@ class _Batch:
 
 
 class _Warnings(logging.Handler):
-    """Counter of the warnings that the python-can readers log, one warning per skipped entry."""
+    """Counter of the warnings of the python-can readers. A reader logs one warning for each entry that it skips."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)

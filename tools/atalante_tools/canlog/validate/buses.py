@@ -10,8 +10,8 @@ import numpy.typing as npt
 from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.reader.chunk import Chunk
 
-#: A channel is assigned to a bus if at least this share (0 to 1) of its frames are messages of the bus.
-#: This share is computed without the frames of unknown messages and of messages with an unsupported layout.
+#: A channel is assigned to a bus if the share of its frames that belong to the bus is at least `_MAJORITY` (0 to 1).
+#: Frames of unknown messages and of messages with an unsupported layout do not count.
 _MAJORITY = 0.9
 
 

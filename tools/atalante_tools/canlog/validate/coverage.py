@@ -55,7 +55,9 @@ def unchecked(validator: Validator, *, live: bool = False) -> list[Unchecked]:
 
 
 def applicable(validator: Validator, rule: str) -> set[str]:
-    """Return the names of the messages in the log to which a rule applies; for the rule wrong-bus the channels of the log.
+    """Return the names of the messages in the log to which a rule applies.
+
+    The rule wrong-bus applies to channels. For this rule, return the names of the channels of the log.
 
     Args:
         validator: finished validator of the log.

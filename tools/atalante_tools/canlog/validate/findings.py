@@ -13,7 +13,8 @@ from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
-#: Maximum number of unknown identifiers with their own finding. One finding `OTHERS` counts all further unknown identifiers.
+#: Maximum number of findings for unknown identifiers, one finding per identifier. One more finding, `OTHERS`, counts the frames
+#: of all other unknown identifiers.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
 #: Rules for which `MAX_UNKNOWN_IDS` limits the number of findings.

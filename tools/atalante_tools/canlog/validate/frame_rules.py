@@ -26,7 +26,7 @@ _CLASSIC_LENGTH = np.arange(256) <= 8
 #: `_OVERFLOW` is two bits in payload byte 1 of an error frame. They mean "receive overflow" and "transmit overflow".
 _CONTROLLER, _OVERFLOW = 0x4, 0x3
 #: The recorder is the node that wrote the log. The log marks the frames of the recorder as sent.
-#: A node counts as the recorder if it sends at least this share (0 to 1) of the frames that the log marks as sent.
+#: A node counts as the recorder if its share of the frames that the log marks as sent is at least `_RECORDER` (0 to 1).
 _RECORDER = 0.99
 
 
@@ -48,8 +48,8 @@ class FrameRules:
         #: Expected FDF and BRS flags of each message: 0, 1, or `UNKNOWN` if the DBC does not define the flag.
         fd = [UNKNOWN if m.fd is None else int(m.fd) for m in layouts]
         switch = [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts]
-        # For a frame of an unknown message, the rules read element 0 of these arrays, and ignore the result.
-        # The additional last element of each array ensures that element 0 exists even if the DBC has no message.
+        # For a frame that cannot be decoded, the rules read element 0 of these arrays, and ignore the result.
+        # Each array has an additional last element. So element 0 exists even if the DBC has no message.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
         #: Node that recorded the log; None if not known yet; empty if the node cannot be determined (see `_RECORDER`).
@@ -202,7 +202,7 @@ class FrameRules:
         numbers, counts = np.unique(strange, return_counts=True)
         named = numbers[np.argsort(-counts, kind="stable")[:MAX_UNKNOWN_IDS]]
         for number in named.tolist():
-            # A 29-bit identifier has eight digits: 0x7f0 and 0x000007f0 are different identifiers.
+            # Show a 29-bit identifier with eight digits: 0x000007f0 has 29 bits, but 0x7f0 has 11 bits.
             name = f"{number & ID_MASK:#010x}" if number & ID_EXTENDED else f"{number:#x}"
             self._add_unknown(name, stamps[strange == number])
         if len(named) < len(numbers):

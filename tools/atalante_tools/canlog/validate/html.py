@@ -158,7 +158,7 @@ class _Axes:
 
 
 def _ticks(low: float, high: float, most: int) -> list[float]:
-    """Return about `most` axis ticks between `low` and `high`, with a spacing of 1, 2 or 5 times a power of ten."""
+    """Return the values of about `most` axis ticks from `low` to `high`. Their spacing is 1, 2 or 5 times a power of ten."""
     rough = (high - low) / most or 1.0
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * unit for unit in (1.0, 2.0, 5.0, 10.0) if power * unit >= rough * (1 - 1e-9))

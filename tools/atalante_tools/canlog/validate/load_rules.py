@@ -43,7 +43,7 @@ def wire_time(extended: bool, fd: bool, switch: bool, length: int, nominal: floa
 
 
 class LoadRules:
-    """Rule for the bus load. The bus load is the fraction of a time window in which a frame is on the bus."""
+    """Rule for the bus load: the total wire time of the frames in a time window, divided by the length of the window."""
 
     def __init__(
         self, plan: Plan, findings: Findings, project: Project, channel_map: ChannelMap, *, keeps_flags: bool
@@ -58,15 +58,15 @@ class LoadRules:
         self._over, self._limit = project.number("bus-load", "over_nominal"), project.number("bus-load", "limit")
         self._of_row = np.array([self._layout_time(row) for row in range(len(plan.layouts))] + [0.0])
         self._bus_of_row = np.append(plan.bus_of_row, 0)
-        #: For each chunk: numbers of the time windows that contain frames, shape (windows,).
-        #: The number of a time window is its start time divided by its length.
+        #: For each chunk: indices of the time windows that contain frames, shape (windows,).
+        #: The index of a time window is its start time divided by the window length.
         self._numbers: list[npt.NDArray[np.int64]] = []
         #: For each chunk: sum of the wire times of the frames [s] per time window and column of `load`, shape (windows, columns).
         self._busy: list[npt.NDArray[np.float64]] = []
         #: Start time of each time window with at least one frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
         #: Bus load in each time window, set by `finish`; 1.0 if frames fill the whole window. Shape (windows, columns).
-        #: The first columns are the buses of the DBC. The further columns are the log channels, for frames whose bus is unknown.
+        #: The first columns are the buses of the DBC. The other columns are the log channels, for frames with an unknown bus.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
     @property

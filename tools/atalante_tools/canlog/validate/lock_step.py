@@ -23,13 +23,14 @@ Stamps = npt.NDArray[np.int64]
 
 #: Name of the signal in a SYNC message that contains the cycle number.
 CYCLE: Final = "Cycle"
-#: If no SYNC arrives within this time [ns], the HAL has probably stopped, and the time stamps follow the wall clock.
+#: Longest time after a SYNC [ns] in which the time stamps follow the cycle number. Without a new SYNC in this time, the HAL has
+#: probably stopped, and the time stamps follow the wall clock.
 PAUSE_NS: Final = 200_000_000
 #: Largest plausible increase of the cycle number from one SYNC to the next. A larger increase or a decrease counts as 1.
 #: A restart of the HAL or a damaged SYNC frame makes the cycle number jump, so the increase is then not plausible.
 MOST_STEPS: Final = 1000
-#: The frames of a cycle get new time stamps at intervals of `_SPACING_NS` [ns]: 0 for SYNC, then 1000, 2000 and so on.
-#: The time from SYNC to a frame is limited to the fraction `_LAST` of the cycle time.
+#: Interval between the new time stamps of consecutive frames in a cycle [ns]. The first frame of a cycle is SYNC.
+#: `_LAST` limits the time from SYNC to the new stamp of a frame, as a fraction of the cycle time.
 _SPACING_NS, _LAST = 1000, 0.7
 
 
@@ -37,13 +38,13 @@ _SPACING_NS, _LAST = 1000, 0.7
 class _Channel:
     """Last SYNC and last frame on one channel, which the lock-step clock needs for the next chunk."""
 
-    #: Message index (position in the arrays of `Plan`) of the first SYNC received on this channel; -1 before this SYNC.
+    #: Message index (position in the arrays of `Plan`) of the first SYNC on this channel; -1 until a SYNC is received.
     #: The clock reads the cycle number only from the message with the index `sync`.
     sync: int = -1
     cycle: int = 0  # cycle number in the last SYNC
     begin: int = 0  # new stamp (robot time) of the last SYNC [ns]
     wall: int = 0  # wall-clock stamp of the last SYNC [ns]
-    count: int = 0  # number of frames since the last SYNC, including this SYNC
+    count: int = 0  # number of frames from the last SYNC to the last frame, both included
     last: int = -(1 << 62)  # new stamp (robot time) of the last frame [ns]
 
 

@@ -28,12 +28,12 @@ class _Bus:
     cycle_ns: float
     count: int = 0  # number of SYNC frames so far
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
-    #: Message index of a state message -> number of the cycle in which its last frame was received.
+    #: Message index of a state message -> cycle number of the last frame, counted in SYNC frames.
     cycle_of: dict[int, int] = field(default_factory=dict)
-    #: Message index of a state message -> number of cycles from its second-last frame to its last frame.
+    #: Message index of a state message -> time between the last two frames of this message [cycles].
     jump_of: dict[int, int] = field(default_factory=dict)
-    #: Message index of a state message -> time stamp of a frame that was perhaps received before its SYNC [ns].
-    #: Only the next chunk shows whether such a state frame was indeed received before its SYNC (see `_check_order`).
+    #: Message index of a state message -> time stamp [ns] of a state frame that perhaps came before the SYNC of its cycle.
+    #: Only the next chunk shows whether the state frame came too early (see `_check_order`).
     doubtful: dict[int, int] = field(default_factory=dict)
 
 

@@ -91,7 +91,7 @@ class Project:
 
 #: Rules with one threshold for each signal name, for example for `Position`. A rules file may add signal names.
 _OPEN = ("step",)
-#: (rule, threshold name) -> smallest and largest valid value. Any other threshold must only be at least 0.
+#: (rule, threshold name) -> smallest and largest valid value. All thresholds that are not listed must be at least 0.
 _RANGE = {("bus-load", "window_s"): (0.001, 3600.0)}
 
 

@@ -179,7 +179,7 @@ def write_junit(results: Sequence[Report | Unread], path: Path) -> None:
 
 
 def _xml_text(text: str) -> str:
-    r"""Return the text with each character that XML does not allow as an escape sequence, such as \x00."""
+    r"""Replace each character that XML does not allow by an escape sequence, such as \x00, and return the new text."""
     return _NOT_IN_XML.sub(lambda found: ascii(found[0])[1:-1], text)
 
 

@@ -206,7 +206,7 @@ class TimingRules:
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
         # Leave out the intervals with lost or rejected frames, and the intervals that begin or end at a repeated frame.
-        # Without an alive counter (`NO_STEP`), lost frames cannot be detected, so intervals that contain lost frames are counted.
+        # Without an alive counter (`NO_STEP`), lost frames cannot be detected. Then intervals with lost frames are also counted.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
@@ -296,9 +296,9 @@ def median(histogram: npt.NDArray[np.int64]) -> float:
 
 
 def jitter_p99(histogram: npt.NDArray[np.int64]) -> float:
-    """Return the jitter: 99 % of the intervals differ from the median interval by at most this value.
+    """Return the jitter: the 99th percentile of the deviation of the intervals from the median interval.
 
-    The jitter is divided by the cycle time. For example, 0.25 means a quarter of the cycle time.
+    The deviation is an absolute value, divided by the cycle time. For example, 0.25 means a quarter of the cycle time.
     """
     total = int(histogram.sum())
     distance, order = _by_distance(len(histogram), int(median(histogram) * BINS_A_CYCLE))

@@ -24,10 +24,10 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: float64 represents every integer up to this value exactly, but rounds some of the larger integers.
+#: Largest integer up to which float64 represents every integer exactly. float64 rounds some of the larger integers.
 _EXACT: Final = 2**53
-#: The value table of a field of at most this length [bit] is stored as a lookup array over all raw codes.
-#: The value table of a field of more than `_TABLE_BITS` bits is stored as a list of the valid codes.
+#: Largest field length [bit] for which the value table is stored as a lookup array over all raw codes.
+#: For a longer field, the value table is stored as a list of the valid codes.
 _TABLE_BITS = 16
 _WORD = 64
 _HASH_BITS = 32
