@@ -112,7 +112,7 @@ class Plan:
         self._groups = [(np.uint32(mask), _Table(rows)) for mask, rows in groups.items()]
 
     def rows(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the message index of each identifier; `UNKNOWN` for identifiers that are not in the DBC. Shape (n,).
+        """Return the message index of each identifier; `UNKNOWN` if the identifier is not in the DBC. Shape (n,).
 
         Args:
             can_ids: identifiers with SocketCAN flags, shape (n,).

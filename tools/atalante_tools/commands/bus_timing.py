@@ -17,12 +17,12 @@ from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import Frames
 from atalante_tools.session.rig import PATIENCE
 
-#: Longest accepted time from a SYNC to the state frame of a node [us].
-#: This time is half a cycle. The HAL waits half a cycle for the state frames after a SYNC, except in lock-step.
+#: Longest accepted time from a SYNC to the state frame of a node [us]: half a cycle.
+#: After a SYNC, the HAL waits half a cycle for the state frames, except in lock-step.
 STATE_BUDGET: Final = PATIENCE * 1e6
 #: Longest accepted time from a SYNC to a command frame of the HAL [us]: one cycle.
-#: A drive applies a received command at the next SYNC, which is one cycle after the SYNC that the command answers.
-#: If the command frame takes longer than one cycle, the drive applies the command one cycle too late.
+#: The HAL answers each SYNC with a command. A drive applies the command at the next SYNC, which is one cycle later.
+#: If the command frame arrives after the next SYNC, the drive applies the command one cycle too late.
 COMMAND_BUDGET: Final = PERIOD * 1e6
 #: Node kinds that answer every SYNC with a state frame.
 _ANSWERING: Final = ("drive", "imu", "foot")
@@ -107,7 +107,10 @@ class BusTiming:
                     self._samples[key].append(stamp - since)
 
     def report(self) -> list[Latency]:
-        """Return one time distribution for each bus and kind of frame (state, command) with samples, in the order of the DBC."""
+        """Return one time distribution for each bus and kind of frame (state or command), in the order of the DBC.
+
+        A bus and kind of frame without samples is left out.
+        """
         return [self._latency(bus, kind) for bus, kind in self._wire if self._samples[bus, kind]]
 
     def _latency(self, bus: str, kind: str) -> Latency:

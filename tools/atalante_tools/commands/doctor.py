@@ -34,7 +34,7 @@ PRIORITY: Final = 50
 #: Linux file with the real-time limits of each user.
 LIMITS: Final = "/etc/security/limits.conf"
 #: Name of a Python package -> purpose of the package, and the pip extra of `atalante-hal` that installs the package.
-#: The empty text "" instead of an extra means that `pip install atalante-hal` already installs the package.
+#: If the extra is the empty text "", `pip install atalante-hal` installs the package without an extra.
 PACKAGES: Final = {
     "pinocchio": ("the model of the controller", ""),
     "pybullet": ("the emulated robot", "[emulator]"),
@@ -121,7 +121,7 @@ def command(interface: str, channel: str, measure: bool, seconds: float, as_json
         _show_facts(interface, as_json)
     if missing := [check for check in checks if check.needed and not check.ok]:
         names = ", ".join(check.name for check in missing)
-        # If only the check of the channel failed, give its reason. The sentence already begins with the name of the channel.
+        # If only the check of the channel failed, show the result of this check. The message already names the channel.
         why = missing[0].text if names == channel else names
         raise Failed(f"{interface} {channel}".rstrip() + f" is not ready: {why}")
     if measure:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 #: Period of the status line [s].
 STATUS_PERIOD: Final = 1.0
-#: Longest wait for a SYNC in lock-step [s]. Without a HAL, Ctrl-C takes effect after at most this time.
+#: Longest wait for a SYNC in lock-step [s]. Ctrl-C without a HAL takes effect at the end of the wait.
 POLL_TIMEOUT: Final = 0.1
 #: Time to listen for another robot before the first frame [s]. Without a HAL, each node sends its status every 0.1 s.
 LISTEN: Final = 0.25
@@ -63,8 +63,8 @@ LISTEN: Final = 0.25
     is_flag=False,
     flag_value=0.6,
     metavar="MU",
-    help="Put the robot on the ground, with this coefficient of friction (0.6 without a number). A crane lowers the robot "
-    "when the HAL is ACTIVE.  [default: suspended in the air]",
+    help="Put the robot on the ground, with the coefficient of friction MU. Without MU, the coefficient is 0.6. A crane lowers "
+    "the robot when the HAL is ACTIVE.  [default: suspended in the air]",
 )
 @click.option(
     "--wearer",

@@ -19,10 +19,9 @@ from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
 #: The emulated pendant stops sending when another pendant sends.
-#: The emulated pendant resumes sending after this number of cycles without a frame of another pendant.
-#: A pendant that has given up (`takeover.LOST_FRAMES`) does not resume.
-#: A silent pendant in another process waits only 3 cycles (`takeover.QUIET_CYCLES`) before it resumes.
-#: The emulated pendant waits longer, so the pendant in the other process resumes first if both pendants are silent.
+#: It resumes sending after `PENDANT_QUIET` cycles without a frame of another pendant, unless it has given up
+#: (`takeover.LOST_FRAMES`).
+#: If both pendants are silent, the other pendant resumes first: it waits only 3 cycles (`takeover.QUIET_CYCLES`).
 PENDANT_QUIET: Final = 12
 #: A second robot is reported if a message of an emulated node, such as LEFT_SH_STATE, is received 3 times in a row.
 #: The alive counters of these 3 frames must increase. Messages of a pendant do not count.

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 #: Longest wait after the move until the joint is at rest [s].
 SETTLE: Final = 1.0
-#: The joint is at rest if it is closer to the target angle than RESTED[0] [rad] and slower than RESTED[1] [rad/s].
+#: The joint is at rest if its distance from the target angle is below RESTED[0] [rad] and its speed is below RESTED[1] [rad/s].
 RESTED: Final = (math.radians(0.05), math.radians(0.5))
-#: The command fails if the joint ends the move further than this angle [rad] from its target angle.
+#: Largest accepted difference between the final and the target angle of the joint [rad]. If it is larger, the command fails.
 TOLERANCE: Final = math.radians(1.0)
 
 

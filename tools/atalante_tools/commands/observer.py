@@ -20,7 +20,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 _STATES: Final = ("HalState", "DriveState", "ImuState", "FootState", "NodeState")
 #: Milliseconds per second.
 MS: Final = 1000.0
-#: The HAL or the pendant is considered lost if its last frame is older than this time [ms].
+#: Largest age of the last frame of the HAL or of the pendant [ms]. A sender with an older frame is considered lost.
 LOST_AGE: Final = 500
 
 
@@ -30,7 +30,7 @@ class NodeReport:
 
     node: str
     kind: str
-    #: Time since the last of the most frequent frames of the node (see `Observer._fast`) [ms]. None before the first frame.
+    #: Time since the last frame of the messages with the shortest period (see `Observer._fast`) [ms]; None before this frame.
     age_ms: int | None
     late: bool  # whether `age_ms` exceeds the message timeout in the DBC
     #: Time since the last status message of the node [ms]. None before the first status message.
@@ -71,7 +71,7 @@ class Report:
     dead_man: bool | None
     nodes: tuple[NodeReport, ...]
     joints: tuple[JointReport, ...]
-    load: dict[str, tuple[float, float]]  # bus -> measured load, and worst-case load computed from the DBC (0 to 1)
+    load: dict[str, tuple[float, float]]  # bus -> (measured load, worst-case load computed from the DBC), each 0 to 1
     frames: int
     foreign: int  # number of frames with an identifier that is not in the DBC
     crc_errors: int
@@ -169,7 +169,7 @@ class Observer:
         return report
 
     def _fast(self, node: Node) -> list[Message]:
-        """Return the most frequent messages of a node: all periodic messages that have the shortest period.
+        """Return the messages of a node that have the shortest period of all its periodic messages.
 
         For the HAL, return only the SYNC messages. The commands have the same period, but the HAL does not always send commands.
         """

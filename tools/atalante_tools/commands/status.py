@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _BLANK: Final = "-"
 #: Listening time before the measurement begins [s]. The measurement excludes frames that were lost while the buses were opened.
-#: SocketCAN reports the number of lost frames with the next frame that it receives. This frame arrives within `WARM_UP`.
+#: SocketCAN reports lost frames only together with the next received frame. This next frame arrives within `WARM_UP`.
 WARM_UP: Final = 0.1
 
 

@@ -15,11 +15,11 @@ from atalante_tools.console.terminal import print_message, show_json
 if TYPE_CHECKING:
     from atalante_hal.types import State
 
-#: The measured level is checked only if the vibration lasts at least this time [s].
+#: Shortest vibration for which the measured level is checked [s].
 #: The slowest motor that `atalante conform` accepts has a time constant of 0.06 s.
-#: This motor reaches 80 % of the commanded level in 0.1 s.
+#: In 0.1 s, such a motor reaches 80 % of the commanded level.
 _CHECKED: Final = 0.1
-#: The command fails if the measured level stays below this share of the commanded level.
+#: Smallest accepted ratio of the highest measured level to the commanded level. If the ratio is smaller, the command fails.
 _REACHED: Final = 0.5
 
 

@@ -53,8 +53,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     default=20,
     show_default=True,
     metavar="N",
-    help="Number of periodic steps, that is, of the steps between the start step and the stop step. With --then: number of "
-    "periodic steps before the first change.",
+    help="Number of periodic steps. These are the steps between the start step and the stop step. With --then, N counts only "
+    "the periodic steps before the first change.",
 )
 @click.option(
     "--xi",
@@ -100,8 +100,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     type=(click.IntRange(1), length, float),
     multiple=True,
     metavar="STEPS LENGTH DURATION",
-    help="After the previous steps, walk this number of steps with another step length [m] and step duration [s]. Can be "
-    "repeated.  [default: no change]",
+    help="After the previous steps, walk STEPS steps with the step length LENGTH [m] and the step duration DURATION [s]. "
+    "Can be repeated.  [default: no change]",
 )
 @gait_options
 @click.option(
@@ -154,9 +154,9 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 @click.option(
     "--robot-process/--no-robot-process",
     default=None,
-    help="Run the emulated robot in a process of its own, in parallel with the HAL. With idle processor cores, the walk is "
-    "then faster. The result is the same.  [default: own process if enough processor cores are idle: one core, or two cores "
-    "with a CAN log or a recording rate above 100 Hz]",
+    help="Run the emulated robot in a separate process, in parallel with the HAL. On idle processor cores, a separate process "
+    "makes the walk faster. The result is the same.  [default: separate process if one processor core is idle; with a CAN log "
+    "or a recording rate above 100 Hz, if two cores are idle]",
 )
 @options_as("recording", RecordingOptions, RECORDING_OPTIONS)
 @target_options(embedded=True)

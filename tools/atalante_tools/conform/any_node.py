@@ -17,7 +17,7 @@ from atalante_tools.conform.technician import Action
 
 #: NMT states in the heartbeat (CiA 301).
 NMT: Final = {0: "BOOTUP", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE_OPERATIONAL"}
-#: Number of cycles without any frame after which a node is considered to be switched off.
+#: A node is considered to be switched off if it sends no frame in `_OFF` consecutive cycles.
 _OFF: Final = 250
 #: `_HEARTBEAT_CYCLES` is the duration of the heartbeat test [cycles].
 #: `_ANSWER_CYCLES` is the duration of the test that checks the answers to SYNC [cycles].
@@ -30,14 +30,14 @@ _FLOOD, _FLOOD_CYCLES = 6, 100
 #: Bit numbers in the SYNC payload. To damage SYNC number k, a test inverts only the bit `_DAMAGED[k]`.
 #: The bits belong to the CRC (0 to 15), the HAL state or the cycle number.
 _DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
-#: Each SYNC test sends this number of defective SYNCs, and a valid SYNC after each of them.
+#: Number of defective SYNCs in each SYNC test. The test sends one valid SYNC after each defective SYNC.
 _WRONG: Final = len(_DAMAGED)
 #: A test result describes only the first 3 defects. It also gives the number of all defects.
 _LISTED: Final = 3
 
 
 def requirements_at_rest(tester: NodeTester) -> list[Requirement]:
-    """Return those requirements for all nodes that are tested while the node is at rest."""
+    """Return the requirements for all nodes, tested while the node is at rest."""
     state = tester.state_message
     requirements = [
         Requirement(
@@ -118,7 +118,7 @@ def requirements_at_rest(tester: NodeTester) -> list[Requirement]:
 
 
 def requirements_on_all_frames(tester: NodeTester) -> list[Requirement]:
-    """Return those requirements for all nodes that are tested on all frames received in the examination."""
+    """Return the requirements for all nodes, tested on all frames received in the examination."""
     all_frames = "all frames received in this examination"
     return [
         Requirement(

@@ -46,13 +46,13 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.QUICK_STOP_ACTIVE: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION, _C.QUICK_STOP),
 }
 
-#: A drive must make each transition within this number of cycles. If a transition takes longer, the HAL aborts the START.
+#: Longest accepted duration of a state transition of a drive [cycles]. If a transition takes longer, the HAL aborts the START.
 FOLLOW: Final = STALLED_CYCLES
-#: Number of cycles for which the test repeats a command that must leave the drive state unchanged.
+#: If a command must leave the drive state unchanged, the test sends the command in `STAY` consecutive cycles.
 STAY: Final = 8
-#: A state frame must show the effect of a command at most this number of cycles after the command.
+#: Longest accepted time from a command to the first state frame that shows the effect of the command [cycles].
 SHOWN: Final = 3
-#: A torque test fails if the measured torque differs from the expected torque by more than this value [Nm].
+#: Largest accepted difference between the measured and the expected torque in a torque test [Nm].
 NOISE: Final = 0.3
 
 

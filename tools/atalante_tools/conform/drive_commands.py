@@ -65,8 +65,8 @@ def ignores_invalid_codes(tester: NodeTester) -> Outcome:
     for quantity in ("Controlword", "TargetTorque", "MaxTorque"):
         code = message.signal(axis.signal(quantity)).invalid_raw
         assert code is not None
-        # Decoded as a number, the invalid code of MaxTorque is a large torque.
-        # A drive that uses the invalid code of MaxTorque as its torque limit produces the target torque, and fails the test.
+        # A drive must not decode the invalid code of MaxTorque as a number, because the number is a large torque.
+        # With this number as the torque limit, the drive produces the target torque, and fails the test.
         received = axis.run(6, _C.ENABLE_OPERATION, 0.0, limit)[2 * SHOWN :]
         for _ in range(2):
             received += axis.send(axis.command(_C.ENABLE_OPERATION, target, limit, raw={quantity: code}))
@@ -150,7 +150,7 @@ def latches(tester: NodeTester) -> Outcome:
 
 
 def latches_late_commands(tester: NodeTester) -> Outcome:
-    """Test DRIVE-24: commands that are too old lead to QUICK STOP ACTIVE, although no command is lost.
+    """Test DRIVE-24: the drive enters QUICK STOP ACTIVE if the commands are too old, even if no command is lost.
 
     The test delays the commands by 4 cycles (`TOLERATED`) three times, so the last commands are 12 cycles late. The drive
     tolerates a delay of 4 cycles. The alive counters are consecutive, so only a comparison with the SYNC shows the delay.
@@ -168,7 +168,7 @@ def latches_late_commands(tester: NodeTester) -> Outcome:
 
 
 def releases_only_when_acknowledged(tester: NodeTester) -> Outcome:
-    """Test DRIVE-14: after a loss of commands, the drive holds its position until QUICK_STOP and then ENABLE_OPERATION arrive."""
+    """Test DRIVE-14: after a loss of commands, the drive obeys ENABLE_OPERATION only after a QUICK_STOP."""
     axis = Axis(tester)
     _latch(axis)
     for controlword in (_C.ENABLE_OPERATION, _C.SHUTDOWN, _C.SWITCH_ON, _C.FAULT_RESET, _C.ENABLE_OPERATION):

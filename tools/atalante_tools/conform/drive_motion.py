@@ -11,13 +11,14 @@ from atalante_hal.types import PERIOD
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome
 
-#: The position change is compared with the integral of the velocity over windows of this number of cycles.
+#: Length of a window [cycles]. In each window, the integral of the velocity is compared with the change of the position.
 WINDOW: Final = 50
-#: The ratio of integral and position change may differ from 1 by at most this number. A filter of the velocity has a small
-#: effect on the ratio, because it delays the integral and does not scale it.
+#: Largest accepted difference between 1 and the ratio of integral to position change. A velocity filter in the drive changes
+#: the ratio only slightly, because the filter delays the integral and does not scale it.
 RATIO: Final = 0.2
-#: A motion is compared only if its root mean square over all windows is at least this angle at the motor [rad]. The velocity is
-#: rounded to the resolution of its signal. The rounding error of the integral over a window is at most a twentieth of this angle.
+#: Smallest root mean square of the motion over all windows, as an angle of the motor [rad]. A smaller motion is not compared.
+#: The velocity signal has a finite resolution. The resulting rounding error of the integral over a window is at most
+#: `MOTION` / 20.
 MOTION: Final = 0.01
 
 

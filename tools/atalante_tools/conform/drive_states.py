@@ -28,9 +28,9 @@ from atalante_tools.conform.technician import Action
 
 _S, _C = DriveState, Controlword
 
-#: After the command QUICK_STOP, a drive must reach QUICK STOP ACTIVE within this number of cycles.
+#: Longest accepted time from the command QUICK_STOP to the drive state QUICK STOP ACTIVE [cycles].
 STOP: Final = 5
-#: In QUICK STOP ACTIVE, a joint may move by at most this angle [rad].
+#: Largest accepted motion of a joint in QUICK STOP ACTIVE [rad].
 MOVEMENT: Final = math.radians(1.0)
 #: CiA 301 emergency codes for a temperature fault are 0x4000 to 0x4FFF.
 TEMPERATURE_CLASS: Final = 0x4000
@@ -125,7 +125,7 @@ def trips_when_hot(tester: NodeTester) -> Outcome:
 
 
 def leaves_fault_when_reset(tester: NodeTester) -> Outcome:
-    """Test DRIVE-23: only FAULT_RESET leaves FAULT.
+    """Test DRIVE-23: in FAULT, only the command FAULT_RESET changes the drive state.
 
     A hot drive stays in FAULT on every command, so the test waits until the drive has cooled.
     """

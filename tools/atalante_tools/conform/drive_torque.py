@@ -40,7 +40,7 @@ def follows_torque(tester: NodeTester) -> Outcome:
 
 
 def respects_the_limit(tester: NodeTester) -> Outcome:
-    """Test DRIVE-08: the drive limits its torque to MaxTorque, even if TargetTorque is the largest or smallest DBC value.
+    """Test DRIVE-08: the drive limits its torque to MaxTorque, even if TargetTorque is at a limit of its DBC range.
 
     The limited torque must have the sign of TargetTorque, and its mean must be at least half of MaxTorque.
     """

@@ -16,18 +16,20 @@ from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import E2E, Outcome, Requirement
 
-#: A motor fails the test HAPTICS-02 if its time constant is larger than this time [s].
+#: Largest time constant of a motor with which the motor passes the test HAPTICS-02 [s].
 TIME_CONSTANT = 0.06
+#: Largest accepted difference between the measured and the expected amplitude of a motor.
 #: Amplitudes and levels are numbers from 0 (off) to 1 (strongest).
-#: In HAPTICS-02, -04 and -05, an amplitude may deviate from the expected amplitude by at most this number.
-#: In HAPTICS-07, a fall of the amplitude by this number shows that a motor stops.
-#: In HAPTICS-02, the expected amplitudes are an exponential curve that is fitted to the measured amplitudes.
+#: HAPTICS-02: the expected amplitudes are an exponential curve that is fitted to the measured amplitudes.
+#: HAPTICS-04: the expected amplitude is the commanded level.
+#: HAPTICS-05: the amplitude may be below 0.5 by at most `LAG`.
+#: HAPTICS-07: an amplitude must fall by at least `LAG` as a sign that the motor stops.
 LAG = 0.05
-#: A motor must reach its commanded level within this number of cycles.
+#: Longest accepted time until a motor reaches its commanded level [cycles].
 _SETTLED: Final = 250
-#: A motor is considered to be at its commanded level if amplitude and level differ by at most this number.
+#: Largest difference between amplitude and commanded level at which a motor is considered to be at the level.
 _STILL: Final = 0.02
-#: Number of defective commands that a test sends, one per cycle.
+#: Number of defective commands that a test sends. HAPTICS-05 sends `_BAD` commands for each raw value.
 _BAD: Final = 40
 
 
@@ -130,8 +132,8 @@ def follows_like_a_lag(tester: NodeTester) -> Outcome:
         if len(rising) < 3:
             return Outcome(False, "a motor does not follow its level")
         squares = rising[:-1] @ rising[:-1]
-        # Fit by least squares the factor by which the distance from the level shrinks between two state frames.
-        # The factor is 0 if the motor reaches the level within one state frame.
+        # In each state frame, the distance from the level is `factor` times the distance in the previous state frame.
+        # Fit `factor` by least squares. It is 0 if the motor reaches the level within one state frame.
         factor = float(rising[1:] @ rising[:-1] / squares) if squares else 0.0
         model = rising[0] * factor ** np.arange(len(rising))
         if factor:
@@ -182,7 +184,7 @@ def stays_in_range(tester: NodeTester) -> Outcome:
 
 
 def stops_without_commands(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-07: without commands, every amplitude has fallen by at least `LAG` at the deadline, and is 0 at the end."""
+    """Test HAPTICS-07: without commands, each amplitude falls by at least `LAG` before the deadline, and finally to 0."""
     bound = _stop_bound(tester)
     before, last_command = _settle(tester, 1.0), tester.cycle_number
     states = tester.states(tester.idle(2 * _SETTLED))

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: Size of the receive buffer [frames].
 _RECEIVE_BUDGET: Final = 128
-#: Longest wait for the state message that answers SYNC [s]. After this time, the tester sends the command anyway.
+#: Longest wait for the state message that answers SYNC [s]. Then the tester sends the command, even without a state message.
 _PATIENCE: Final = 0.6e-3
 #: Time to listen for another HAL before the first frame is sent [s].
 _LISTEN: Final = 0.2
@@ -38,7 +38,7 @@ class NotTested(Exception):  # noqa: N818
 class Clock(Protocol):
     """Clock that starts the cycles."""
 
-    delay: float  # largest delay with which this computer started a cycle of the current test [s]
+    delay: float  # largest delay of a cycle start in the current test, caused by this computer [s]
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
         """Wait for the start of the next cycle.

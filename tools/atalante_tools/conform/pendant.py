@@ -12,7 +12,7 @@ from atalante_tools.conform.technician import Action
 
 #: Values of `PENDANT_STATE.Request`.
 START, STOP, HOLD = 1, 2, 3
-#: After a button press, the pendant must not send a second request for this number of cycles.
+#: Time after a button press in which the pendant must not send a second request [cycles].
 _AFTER: Final = 50
 SOURCE: Final = "DBC PENDANT_STATE"
 

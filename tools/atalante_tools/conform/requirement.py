@@ -9,9 +9,11 @@ from typing import Final
 
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 
-#: A failed test does not count if this computer started a cycle with at least this delay [s]. The test is then repeated.
+#: Smallest delay of a cycle start for which this computer counts as late [s]. A test that fails while this computer is late
+#: does not count and is repeated.
 LATE: Final = 2e-3
-#: If a test fails this number of times while this computer is late, the verdict is "not tested".
+#: Largest number of attempts per test. If this computer is late in every attempt and every attempt fails, the verdict is
+#: "not tested".
 ATTEMPTS: Final = 3
 #: Standard of the counter and the CRC, for the text of the requirements.
 E2E: Final = "AUTOSAR E2E Profile 5"

@@ -15,14 +15,14 @@ from atalante_tools.conform.requirement import Outcome, Requirement
 
 #: Number of cycles in which a test measures a sensor.
 _MEASURED: Final = 100
-NORM: Final = 1e-3  # the length of a quaternion may differ from 1 by at most this number
+NORM: Final = 1e-3  # largest accepted difference between 1 and the length of a quaternion
 #: Largest difference between the magnitude of the mean acceleration and `GRAVITY` [m/s2].
 SPECIFIC_FORCE: Final = 0.3
 #: For an IMU at rest: largest angle between the upward directions that accelerometer and quaternion give [rad].
 TILT: Final = math.radians(3.0)
 #: Largest difference between the rate of the gyro and the angular rate computed from the quaternions [rad/s].
 RATE: Final = 0.05
-UNLOADED: Final = 10.0  # the mean force on each axis of an unloaded force cell may be at most this force [N]
+UNLOADED: Final = 10.0  # largest accepted magnitude of the mean force on each axis of an unloaded force cell [N]
 
 _VECTOR: Final = ("X", "Y", "Z")
 _AT_REST: Final = f"mean of {_MEASURED} ms at rest"
@@ -162,7 +162,7 @@ def _has_no_error(name: str) -> Callable[[NodeTester], Outcome]:
 
 
 def _is_unloaded(cells: Sequence[str]) -> Callable[[NodeTester], Outcome]:
-    """Return a test which requires that the magnitude of the mean force on every axis of the cells is at most `UNLOADED`."""
+    """Return a test of the mean force on each axis of each cell. The magnitude of the mean must be at most `UNLOADED`."""
     names = [f"{cell}_Force{axis}" for cell in cells for axis in _VECTOR]
 
     def test(tester: NodeTester) -> Outcome:

@@ -32,8 +32,8 @@ LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} 
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
 #: Pairs (drive state, controlword) without a check of the response, because the drive may ignore the controlword.
-#: ENABLE_OPERATION: a drive that stopped without a command may ignore this controlword until it receives QUICK_STOP.
-#: FAULT_RESET: a drive may ignore this controlword while the cause of the fault persists.
+#: ENABLE_OPERATION: if a drive stopped without a command, the drive may ignore ENABLE_OPERATION until QUICK_STOP arrives.
+#: FAULT_RESET: while the cause of the fault persists, the drive may ignore FAULT_RESET.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 

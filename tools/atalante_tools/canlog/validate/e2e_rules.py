@@ -38,8 +38,8 @@ class CrcRules:
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: Ranges of message indices, one range per payload length. Only payload lengths of messages with a CRC have a range.
-        #: A range also contains the messages of the same length that have no CRC. `check` ignores these messages.
+        #: Ranges of message indices, one range for each payload length of the messages with a CRC.
+        #: A range also contains messages of the same length without a CRC. `check` ignores these messages.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]
