@@ -21,7 +21,7 @@ from atalante_tools.session.rig import PATIENCE
 #: After a SYNC, the HAL waits half a cycle for the state frames, except in lock-step.
 STATE_BUDGET: Final = PATIENCE * 1e6
 #: Longest accepted time from a SYNC to a command frame of the HAL [us]: one cycle.
-#: The HAL answers each SYNC with a command. A drive applies the command at the next SYNC, which is one cycle later.
+#: The HAL answers each SYNC with a command. A drive applies the command at the next SYNC, one cycle after the answered SYNC.
 #: If the command frame arrives after the next SYNC, the drive applies the command one cycle too late.
 COMMAND_BUDGET: Final = PERIOD * 1e6
 #: Node kinds that answer every SYNC with a state frame.

@@ -21,7 +21,8 @@ from atalante_tools.session.takeover import PendantReader, Takeover
 #: The emulated pendant stops sending when another pendant sends.
 #: It resumes sending after `PENDANT_QUIET` cycles without a frame of another pendant, unless it has given up
 #: (`takeover.LOST_FRAMES`).
-#: If both pendants are silent, the other pendant resumes first: it waits only 3 cycles (`takeover.QUIET_CYCLES`).
+#: If both pendants are silent, the other pendant resumes first, because its waiting time is only 3 cycles
+#: (`takeover.QUIET_CYCLES`).
 PENDANT_QUIET: Final = 12
 #: A second robot is reported if a message of an emulated node, such as LEFT_SH_STATE, is received 3 times in a row.
 #: The alive counters of these 3 frames must increase. Messages of a pendant do not count.

@@ -30,7 +30,8 @@ class NodeReport:
 
     node: str
     kind: str
-    #: Time since the last frame of the messages with the shortest period (see `Observer._fast`) [ms]; None before this frame.
+    #: Time since the last frame of the messages with the shortest period (see `Observer._fast`) [ms].
+    #: None before the first of these frames.
     age_ms: int | None
     late: bool  # whether `age_ms` exceeds the message timeout in the DBC
     #: Time since the last status message of the node [ms]. None before the first status message.

@@ -184,7 +184,7 @@ def stays_in_range(tester: NodeTester) -> Outcome:
 
 
 def stops_without_commands(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-07: without commands, each amplitude falls by at least `LAG` before the deadline, and finally to 0."""
+    """Test HAPTICS-07: without commands, each amplitude falls by at least `LAG` until the deadline, and finally to 0."""
     bound = _stop_bound(tester)
     before, last_command = _settle(tester, 1.0), tester.cycle_number
     states = tester.states(tester.idle(2 * _SETTLED))

@@ -39,7 +39,7 @@ Text = npt.NDArray[np.uint8]
 
 #: Number of bytes that the memory must have after the end of the text, because the parser may also read these bytes.
 MARGIN = 1
-#: Minimum length of a text [byte] for which the compiled function is used. To load numba takes as long as to parse
+#: Minimum length of a text for the compiled function [byte]. The time to load numba equals the time to parse
 #: 2 * `_COMPILED_BYTES` bytes with the regular expression.
 _COMPILED_BYTES = 1 << 20
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT, _R, _T = b"\n\r ()#.RT"

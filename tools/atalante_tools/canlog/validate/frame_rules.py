@@ -202,7 +202,7 @@ class FrameRules:
         numbers, counts = np.unique(strange, return_counts=True)
         named = numbers[np.argsort(-counts, kind="stable")[:MAX_UNKNOWN_IDS]]
         for number in named.tolist():
-            # Show a 29-bit identifier with eight digits: 0x000007f0 has 29 bits, but 0x7f0 has 11 bits.
+            # Show a 29-bit identifier with eight digits. So 0x000007f0 has 29 bits, and 0x7f0 has 11 bits.
             name = f"{number & ID_MASK:#010x}" if number & ID_EXTENDED else f"{number:#x}"
             self._add_unknown(name, stamps[strange == number])
         if len(named) < len(numbers):

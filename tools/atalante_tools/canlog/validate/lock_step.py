@@ -29,8 +29,8 @@ PAUSE_NS: Final = 200_000_000
 #: Largest plausible increase of the cycle number from one SYNC to the next. A larger increase or a decrease counts as 1.
 #: A restart of the HAL or a damaged SYNC frame makes the cycle number jump, so the increase is then not plausible.
 MOST_STEPS: Final = 1000
-#: Interval between the new time stamps of consecutive frames in a cycle [ns]. The first frame of a cycle is SYNC.
-#: `_LAST` limits the time from SYNC to the new stamp of a frame, as a fraction of the cycle time.
+#: `_SPACING_NS` is the interval between the new time stamps of consecutive frames in a cycle [ns].
+#: `_LAST` is the largest time from SYNC to the new time stamp of a frame in the cycle, as a fraction of the cycle time.
 _SPACING_NS, _LAST = 1000, 0.7
 
 

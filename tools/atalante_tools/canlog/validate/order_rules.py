@@ -28,11 +28,11 @@ class _Bus:
     cycle_ns: float
     count: int = 0  # number of SYNC frames so far
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
-    #: Message index of a state message -> cycle number of the last frame, counted in SYNC frames.
+    #: Message index of a state message -> number of SYNC frames in the log before the last frame of this message.
     cycle_of: dict[int, int] = field(default_factory=dict)
-    #: Message index of a state message -> time between the last two frames of this message [cycles].
+    #: Message index of a state message -> number of SYNC frames between the last two frames of this message.
     jump_of: dict[int, int] = field(default_factory=dict)
-    #: Message index of a state message -> time stamp [ns] of a state frame that perhaps came before the SYNC of its cycle.
+    #: Message index of a state message -> time stamp [ns] of a state frame that perhaps came before the SYNC it answers.
     #: Only the next chunk shows whether the state frame came too early (see `_check_order`).
     doubtful: dict[int, int] = field(default_factory=dict)
 

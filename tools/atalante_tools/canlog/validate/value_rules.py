@@ -24,7 +24,7 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: Largest integer up to which float64 represents every integer exactly. float64 rounds some of the larger integers.
+#: float64 represents every integer from 0 to `_EXACT` exactly, but rounds some of the larger integers.
 _EXACT: Final = 2**53
 #: Largest field length [bit] for which the value table is stored as a lookup array over all raw codes.
 #: For a longer field, the value table is stored as a list of the valid codes.
