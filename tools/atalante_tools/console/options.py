@@ -124,7 +124,7 @@ class OutputFile(click.Path):
         return path
 
 
-#: A length of at least this number is read as centimetres, a smaller length as metres: 175 is 175 cm, 1.75 is 1.75 m.
+#: Smallest number that is read as a length in centimetres. A smaller number is read as metres: 175 is 175 cm, 1.75 is 1.75 m.
 _CENTIMETRES: Final = 5.0
 
 #: Default step length [m] and default step duration [s] of a patient.
@@ -132,7 +132,7 @@ DEFAULT_STEP: Final = (0.15, 0.9)
 
 
 def length(text: str) -> float:
-    """Option type for a length: converts the text of the user to metres. For example, 1.75 and 175 are both 1.75 m.
+    """Convert a length that the user typed to metres. For example, 1.75 and 175 both give 1.75 m.
 
     Args:
         text: Length of a body part or a step. Numbers below 5 are metres, other numbers are centimetres.
@@ -187,7 +187,7 @@ def _segment_option(name: str, ends: str) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True)
 class GaitFiles:
-    """Files from which a command takes its gait. At most one of them is given."""
+    """Gait file and network file of a command. The user gives at most one of the two files."""
 
     gait: Path | None = None  # gait file or walk file
     network: Path | None = None  # file of a neural gait network; None means the file installed with `atalante_control`
@@ -198,7 +198,7 @@ class GaitFiles:
         return "".join(f" --{name} {path}" for name, path in (("gait", self.gait), ("network", self.network)) if path)
 
     def require_patient(self, patient: object) -> None:
-        """Raise an error if the option `--network` (gait network) is given, but no patient.
+        """Raise an error if the user gives the option `--network` (gait network) without a patient.
 
         Args:
             patient: Patient or subject that the user gave, or None.
@@ -227,7 +227,7 @@ def _gait_files(gait: Path | None, network: Path | None) -> GaitFiles:
         if gait is not None and typed(name):
             raise click.UsageError(
                 f"--{name.replace('_', '-')} has no effect with --gait, because the gait file contains length and duration "
-                "of the step: use only one of the two options"
+                f"of the step: omit --{name.replace('_', '-')} or --gait"
             )
     return GaitFiles(gait, network)
 

@@ -50,7 +50,8 @@ class FaultLatched(Failed):
     exit_code = FAULT_LATCHED
 
 
-#: Known library errors: module name, class name, and the `Failed` class that replaces the error. The first match counts.
+#: Known library errors: module name, class name, and the subclass of `Failed` to which the error is converted.
+#: If several rows match an error, the first one is used.
 KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.bus", "BusAbsent", NoDevice),
     ("atalante_hal.bus", "BusDown", NoDevice),
@@ -103,7 +104,7 @@ def failure_of(error: BaseException) -> Failed | None:
 
 @contextmanager
 def one_sentence() -> Iterator[None]:
-    """Print a known error of the block as one sentence on stderr, and end the program with the exit code of the error.
+    """Print a known error of the `with` block as one sentence on stderr, and end the program with the exit code of the error.
 
     The command line `atalante` does this for its commands. This function is for other programs, such as those in `examples/`.
 

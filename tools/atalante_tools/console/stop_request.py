@@ -1,4 +1,4 @@
-"""Stop request of the process: stores that a stop signal arrived.
+"""Stop request of the process: a record that a stop signal arrived.
 
 The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed, or its connection was lost).
 
@@ -21,9 +21,9 @@ TYPE_CHECKING = False  # replaces `typing.TYPE_CHECKING`, because the import of 
 if TYPE_CHECKING:
     from types import FrameType
 
-#: The exit code after a signal is this number plus the signal number (shell convention).
+#: Offset of the exit code after a signal (shell convention): exit code = `SIGNALLED` + signal number.
 SIGNALLED = 128
-#: Stop signals that end the process if they arrive after another stop signal.
+#: Stop signals that end the process at once if the process has already received a stop signal.
 #: SIGHUP is not in the list, because the shell and the kernel may both send SIGHUP when a terminal closes.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

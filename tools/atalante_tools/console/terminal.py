@@ -32,7 +32,7 @@ def print_message(text: str) -> None:
 
 
 class CompilationNotice(logging.Handler):
-    """Log handler that prints a message when the first function is compiled, because compilation takes seconds."""
+    """Log handler that prints one message at the first compilation of a function, because compilation can take minutes."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -94,7 +94,7 @@ class Progress:
         self._begun = now()
         self._next = self._begun + self._period
         self._width = 0  # length of the last line [characters]
-        self._written = 0  # length of the last line and of the spaces written after it [characters]
+        self._written = 0  # length of the last line, including the spaces written at its end [characters]
 
     def due(self) -> bool:
         """Return whether it is time to print the next progress line.
@@ -140,7 +140,7 @@ class Progress:
             self._width = self._written = 0
 
     def _to_start(self) -> str:
-        """Return the control characters that move the cursor to the start of the last line, which may cover several rows."""
+        """Return the control characters that move the cursor to the start of the last line. A long line covers several rows."""
         try:
             columns = os.get_terminal_size(self._stream.fileno()).columns
         except OSError:

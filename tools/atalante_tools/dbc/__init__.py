@@ -132,7 +132,7 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
     default=10_000,
     show_default=True,
     metavar="N",
-    help="Number of comparisons, each with one random payload of every message. Requires --check.",
+    help="Number of comparisons. Each comparison tests one random payload of every message. Requires --check.",
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random payloads.")
 @json_option

@@ -71,12 +71,16 @@ def write(build: Build, folder: Path, seed: int) -> list[Path]:
 
 
 def _check_names(build: Build) -> None:
-    """Raise `Failed` if a name is a C keyword or begins with a digit, or if two names are equal in snake case."""
+    """Raise `Failed` if a name in the DBC file cannot be used in the generated C code.
+
+    The file name must begin with a letter, and must differ from the name of the host test. A signal must not be named like a C
+    keyword. No two messages or signals may have the same name in snake case.
+    """
     file = f"{build.name}.c"
     if not build.name[0].isalpha() or file == _HOST_TEST:
         raise Failed(
-            f"name of the C file must differ from {_HOST_TEST} and must begin with a letter, because it is the prefix of all "
-            f"C names, got {file}: rename the DBC file"
+            f"name of the C file must differ from {_HOST_TEST} and must begin with a letter, because all C names begin with the "
+            f"file name, got {file}: rename the DBC file"
         )
     _check_distinct("messages", [m.name for m in build.messages])
     for message in build.messages:
@@ -84,7 +88,7 @@ def _check_names(build: Build) -> None:
         _check_distinct(f"signals of {message.name}", names)
         if keywords := [name for name in names if camel_to_snake_case(name) in _KEYWORDS]:
             raise Failed(f"signals of {message.name} must not be named like C keywords, got {', '.join(keywords)}")
-    # The C functions of a signal begin with the names of message and signal: A.B_C and A_B.C are both a_b_c.
+    # The name of a C function begins with the message name and the signal name: A.B_C and A_B.C both become a_b_c.
     signals = [f"{m.name}.{s.name}" for m in build.messages for s in m.signals]
     _check_distinct("messages and signals", [*(m.name for m in build.messages), *signals])
 

@@ -92,7 +92,7 @@ def _timing(old: Message, new: Message) -> Iterator[Change]:
     elif old.cycle_ms != new.cycle_ms:
         yield Change(True, "timing", new.name, f"cycle {old.cycle_ms} -> {new.cycle_ms} ms")
     if old.timeout_ms != new.timeout_ms:
-        # A changed timeout is breaking only if the timeout in one DBC is at most the cycle time in the other DBC.
+        # A changed timeout prevents communication only if the timeout in one DBC is at most the cycle time in the other DBC.
         # Example: with a timeout of 5 ms and a cycle time of 10 ms, the receiver times out before the next frame.
         breaks = 0 < old.timeout_ms <= new.cycle_ms or 0 < new.timeout_ms <= old.cycle_ms
         yield Change(breaks, "timing", new.name, f"timeout {old.timeout_ms} -> {new.timeout_ms} ms")

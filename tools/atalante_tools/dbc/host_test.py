@@ -168,7 +168,7 @@ static const struct {{
 
 
 def _counter_check(name: str) -> str:
-    """Return the C function that checks a frame with counter 0, and then a frame with counter k, for each k from 0 to 255.
+    """Return the C function that tests the counter check: a frame with counter 0, followed by a frame with counter 0 to 255.
 
     The function compares each result of the E2E check with the result of the Python check.
     """

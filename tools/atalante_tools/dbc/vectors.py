@@ -67,9 +67,10 @@ class Vectors:
         self._order = self._stream_order()
 
     def _half_steps(self) -> Vector:
-        """Return one physical value per signal, shape (signals,): half a quantisation step above an even raw code.
+        """Return one physical value per signal for the test of rounding, shape (signals,).
 
-        The value is the minimum of the signal if its range has no such code or if float64 arithmetic is not exact.
+        The value lies half a quantisation step above an even raw code. If the range of the signal has no such code, or if
+        float64 arithmetic is not exact, the value is the minimum of the signal.
         """
         plan = self._codec.table.plan
         factor, offset = np.array([(s.factor, s.offset) for _, s in self._codec.signals]).T

@@ -1,4 +1,4 @@
-"""Clock of the HAL loop: it keeps the emulated robot running while the loop is late or sends no SYNC.
+"""Clock of the HAL loop. While the loop is late or sends no SYNC, the clock keeps the emulated robot running.
 
 In lock-step, the emulated robot runs one cycle per SYNC. Without this clock, the robot would stand still while a fault of the
 host suppresses the SYNC or delays the loop, and a robot on the ground would not fall.

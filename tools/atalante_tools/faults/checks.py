@@ -16,9 +16,9 @@ from atalante_tools.faults.observation import Observation
 _KNEE: Final = JOINTS.index("left_SK")
 #: Largest permitted motion of a joint while the drives are being enabled [rad].
 _SAG: Final = math.radians(1.0)
-#: Largest number of cycles from START to the event START_FAILED if a drive cannot be enabled.
+#: Largest accepted number of cycles from START to the event START_FAILED, for a drive that cannot be enabled.
 _FAILED: Final = 20
-#: After this number of cycles without a command, a drive must hold its position by itself (local hold).
+#: Number of cycles without a command after which a drive must hold its position by itself (local hold).
 #: `_WATCHDOG` is not imported from the emulated drive, so that an error in the emulator cannot change the check.
 _WATCHDOG: Final = 5
 #: Largest accepted true speed of a joint, as a multiple of its velocity limit.

@@ -19,7 +19,7 @@ from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import FRAME, Frames
 
 Vector = npt.NDArray[np.float64]
-#: Resolution of the torque signals [Nm]. Because of rounding, a sent torque may exceed the torque limit by this value.
+#: Resolution of the torque signals [Nm]. Because of rounding, a sent torque may exceed the torque limit by one resolution step.
 _RESOLUTION: Final = 0.0125
 _PERIOD: Final = 1e-3  # s
 
@@ -69,9 +69,9 @@ class _Leg:
         )
 
     def consecutive(self) -> npt.NDArray[np.bool_]:
-        """Return for each frame and joint whether this frame and the frame of the next cycle both enable the drive.
+        """Return for each frame and joint whether two consecutive cycles enable the drive, shape (n - 1, 6).
 
-        Shape (n - 1, 6).
+        Element k is True if the frames k and k + 1 both enable the drive and belong to consecutive cycles.
         """
         enabled = self.word == Controlword.ENABLE_OPERATION
         return np.asarray(enabled[1:] & enabled[:-1] & (np.diff(self.cycle) == 1)[:, None])

@@ -21,7 +21,7 @@ from atalante_tools.faults.scenario import HostFault, OperatorAction, Stimulus
 if TYPE_CHECKING:
     from atalante_emulator.pendant import Operator
 
-#: Mask of the joint that the fault `shake` disturbs, shape (12,): 1 for the left hip, 0 for all other joints.
+#: Mask of the joint that the fault `shake` disturbs, shape (12,): 1 for the left sagittal hip, 0 for all other joints.
 _HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
 #: Torque request of the fault `full_torque`, above the torque limit of every joint [Nm].
 _TOO_MUCH: Final = 1e3
@@ -37,7 +37,7 @@ class HostFaults:
         self.first_active: int | None = None
 
     def schedule(self, faults: Sequence[HostFault], begins: int) -> None:
-        """Replace the faults.
+        """Replace all faults with new faults.
 
         Args:
             faults: new faults. Their `start` counts from `begins`.
@@ -82,7 +82,7 @@ class TimedStimuli:
         self.schedule(stimuli, begins)
 
     def schedule(self, stimuli: Sequence[Stimulus], begins: int) -> None:
-        """Replace the faults, and add the actions of the operator.
+        """Replace all faults with new faults. Add operator actions to the existing actions.
 
         Args:
             stimuli: faults and operator actions. Their `start` counts from `begins`.

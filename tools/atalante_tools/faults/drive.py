@@ -20,7 +20,7 @@ from atalante_tools.faults.checks import (
 from atalante_tools.faults.scenario import Case, HostFault, OperatorAction, Scenario
 
 _S = SupervisorState
-#: Joint that hardly moves while the left leg swings. Therefore the HAL does not take a jump of its encoder for real motion, and
+#: Joint that hardly moves while the left leg swings. Therefore the HAL recognises a jump of the joint encoder as a fault, and
 #: rejects the new position.
 _STILL: Final = "RIGHT_FH"
 _KNEE: Final = "LEFT_SK"
@@ -28,7 +28,7 @@ _HIP: Final = "LEFT_SH"
 _IMU: Final = "IMU_TORSO"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: Time from the end of the fault to START [cycles], if a knee sinks in LOWER or FAULT.
-#: After this time, the knee is at rest, so its drive can be enabled again.
+#: At START, the knee is then at rest, and its drive can be enabled again.
 _LOWERED: Final = 4500
 #: Time from the end of the fault to START [cycles], if the HAL has switched off the faulty drive.
 #: The joint of this drive may still be sinking when START is pressed. START enables the drive, which then holds the joint.
@@ -36,7 +36,7 @@ _UNTIL_START: Final = 600
 #: Time from HOLD until all joints are at rest [cycles].
 _AT_REST: Final = 60
 
-#: Name of a case -> faults that restart drives during the walk. A restarted drive must be enabled again.
+#: Dictionary from case name to faults. Each fault restarts a drive during the walk. A restarted drive must be enabled again.
 _RESTARTED: Final = {
     "one drive restarted": (Fault("reset", _HIP, 0, 3),),
     "two drives restarted": (Fault("reset", _HIP, 0, 3), Fault("reset", "RIGHT_SK", 0, 3)),
@@ -363,7 +363,7 @@ SCENARIOS: Final = (
         ),
     ),
     # A faulty motor is visible only in the motion of its joint, because its drive still reports the commanded torque.
-    # The Henke ankle (HA) moves little, because its commanded torque is below its dry friction. So the detection takes longer.
+    # The commanded torque of the Henke ankle (HA) is below the dry friction, so HA moves little and the detection takes longer.
     # The sagittal ankle (SA) has no case with a reversed motor, because this case would fail the check `limit_violations`:
     # SA would exceed the velocity limit before the HAL can detect the fault.
     Scenario(
