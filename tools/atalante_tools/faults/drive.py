@@ -385,7 +385,7 @@ SCENARIOS: Final = (
             )
         ),
     ),
-    # Each push accelerates the joint above its top speed within 25 cycles, the time limit of F71.
+    # Each push accelerates the joint above its top speed within the time limit of F71, which is 25 cycles.
     Scenario(
         "F71",
         tuple(

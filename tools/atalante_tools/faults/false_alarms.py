@@ -28,7 +28,7 @@ _SHAPES: Final = ("constant", "pinched")
 _FACTORS: Final = (1.0, 0.75, 0.5, 0.25, 0.0)
 #: True mass of the patient, relative to the mass for which the gait and the model in the HAL are made.
 _MASSES: Final = (1.0, 0.9, 1.1)
-#: Number n: the muscles of the patient are active in every n-th walk on the ground.
+#: In one of every `_ACTIVE` walks on the ground, the muscles of the patient are active.
 _ACTIVE: Final = 4
 
 
@@ -49,7 +49,7 @@ class Quiet:
 
     @property
     def failed(self) -> bool:
-        """Return whether there was a false alarm, or the robot did not walk to the end."""
+        """Return True if there was a false alarm or if the robot did not walk to the end."""
         return bool(self.alarms) or not self.finished
 
 

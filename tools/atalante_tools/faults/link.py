@@ -25,7 +25,7 @@ _BUSES: Final = ("left_leg", "right_leg", "left_sense", "right_sense")
 _KNEE: Final = "LEFT_SK"
 #: State message of the drive `_KNEE`.
 _STATE: Final = "LEFT_SK_STATE"
-#: Raw code with which this drive reports that it has no position.
+#: Raw code that the drive `_KNEE` sends if it has no valid position.
 _NO_POSITION: Final = invalid_code(_STATE, "Position")
 #: Message with the command of the drive `_KNEE`.
 _COMMAND: Final = "COMMAND_LEFT_LEG"
@@ -305,7 +305,8 @@ SCENARIOS: Final = (
         permanent=Case("permanent", (Fault("flags", _STATE, flags=_ERROR_PASSIVE),)),
     ),
     # A second sender copies the last frame of a node, changes signals of the copy, and adds `ahead` to its alive counter.
-    # If `ahead` is 1, the copy has the counter of the node's next frame. If `ahead` is 0, it has the counter of the last frame.
+    # If `ahead` is 1, the copy has the counter of the node's next frame. If `ahead` is 0, the copy has the
+    # counter of the node's last frame.
     Scenario(
         "F58",
         (

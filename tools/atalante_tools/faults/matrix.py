@@ -16,7 +16,7 @@ from atalante_hal.types import SupervisorState
 
 MATRIX_FILE: Final = Path(__file__).with_name("FAULTS.md")
 COLUMNS: Final = ("ID", "Fault", "Detected by", "Cycles", "Reaction", "State", "DTC", "Proof")
-#: The column Proof contains this text if a scenario of the catalogue tests the fault. The scenario has the ID of the fault.
+#: Text in the column Proof of a fault that a scenario of the catalogue tests. The scenario has the ID of the fault.
 SCENARIO: Final = "scenario"
 _ID = re.compile(r"F\d\d")
 _BOUND = re.compile(r"(\d+)(?: / (\d+))?")
@@ -44,7 +44,7 @@ class Row:
 
     @property
     def detected(self) -> int | None:
-        """Return the cycle by which the diagnostic must be reported; None if the row has no number.
+        """Return the cycle by which the diagnostic must be reported; None if the column Cycles contains no number.
 
         The first faulty cycle is cycle 1.
         """
@@ -53,7 +53,7 @@ class Row:
 
     @property
     def reacted(self) -> int | None:
-        """Return the cycle by which the reaction must occur; None if the row has no number.
+        """Return the cycle by which the reaction must occur; None if the column Cycles contains no number.
 
         The first faulty cycle is cycle 1. In the text "1 / 5", the cycle of the reaction is 5.
         """

@@ -45,9 +45,10 @@ _S = SupervisorState
 SAG_MAX: Final = 1.0
 #: Codes of the events with which the HAL reports that a start ended without reaching ACTIVE.
 _ENDS_OF_START: Final = ("START_FAILED", "START_REFUSED")
-#: Kind of a fault that moves joints during a start -> largest accepted motion [deg] of every joint in the leg with the fault.
+#: Largest accepted motion of a joint during a start [deg], for each kind of fault that moves joints during a start.
+#: This limit applies to all joints of a leg with the fault.
 #: A faulty motor or an exchanged encoder moves a joint until the direction test at the end of the start detects the fault (F72).
-#: With a push, the motion is not limited, because a push may be stronger than the torque that holds the joint.
+#: For a push, the motion has no limit, because a push may be stronger than the torque that holds the joint.
 SAG_OF: Final = {
     "torque_wrong": 5.0,
     "torque_weak": 5.0,
@@ -57,15 +58,15 @@ SAG_OF: Final = {
     "value": 5.0,
     "push": math.inf,
 }
-#: Kinds of motor faults. Until the HAL finds a motor fault, the joints of its leg may move faster than their velocity limits.
+#: Kinds of motor faults. Until the HAL finds a motor fault, the joints of the faulty leg may exceed their velocity limits.
 #: The speeds of these joints are not checked for `FOUND` cycles after the fault begins, and for `FOUND` cycles after each later
 #: START. Cycles in which the HAL receives no data of the drive do not count, because another fault hides the motor fault (see
 #: `_SILENT`).
 _MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
-#: The HAL cannot find a motor fault of a drive while the data age of this drive is at least this number [cycles].
-#: Such cycles do not count in `FOUND`.
+#: Smallest data age of a drive [cycles] at which the HAL cannot find a motor fault of the drive.
+#: Cycles with this data age or a higher one do not count in `FOUND`.
 _SILENT: Final = 5
 #: Number of cycles from READY to the operator's START.
 _PAUSE: Final = 50
@@ -76,7 +77,7 @@ _RESTART: Final = 200
 #: Longest wait for the end of a fault [cycles]. The run continues after this wait, even if the fault is permanent.
 _LONGEST: Final = 400
 #: Number of cycles from the end of the fault to the next press of START. A fault counts as ended after `_LONGEST` cycles.
-#: If the schedule has a START after the end of the fault, the cycles count from this START.
+#: If a START of the schedule comes after the end of the fault, the cycles count from this START.
 _REST: Final = 60
 #: Number of cycles from the second press of START after the fault to the end of the run.
 _END: Final = 300
@@ -98,7 +99,7 @@ class Schedule:
     """Times of a run, in HAL cycles."""
 
     begins: int  # first faulty cycle
-    #: cycles in which the operator presses START, without the two presses that `_observe` adds after the fault
+    #: cycles in which the operator presses START. The two presses that `_observe` adds after the fault are not included.
     starts: tuple[int, ...]
     stop: int | None = None  # cycle in which the operator presses STOP
 
@@ -132,12 +133,12 @@ class Extreme(NamedTuple):
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest values of a run: speed and torque step of a joint, and motion of a joint during a start and after the walk."""
+    """Largest values of a run: joint speed, torque step, joint motion during a start, and joint motion after the walk."""
 
     speed: Extreme  # joint velocity divided by the velocity limit of the joint
     torque_step: Extreme  # change of the commanded torque in one cycle [Nm]
     sag: Extreme  # motion of a joint during a start [deg], measured as in `SAG_MAX`
-    #: distance of a joint from its position in the first cycle after the walk [deg], measured until the robot walks again
+    #: motion of a joint after the walk [deg]. It is measured from the first cycle after the walk until the robot walks again.
     lost: Extreme
 
 
@@ -163,7 +164,7 @@ class MomentTask:
     engine: str = PYBULLET
 
     def __call__(self) -> MomentVerdict:
-        """Run the cases together in one run. Check the rules that apply to any fault at any moment, see the module docstring."""
+        """Run the cases together in one run. Check the rules for all faults and moments (see the module docstring)."""
         chosen = [SCENARIOS[id_].cases[index] for id_, index in self.cases]
         names = tuple(f"{id_} {case.name}" for (id_, _), case in zip(self.cases, chosen, strict=True))
         stimuli = tuple(shifted(s, d) for case, d in zip(chosen, self.delays, strict=True) for s in case.stimuli)
@@ -249,9 +250,9 @@ def _motor_faults(stimuli: Sequence[Stimulus]) -> list[Fault]:
 
 
 def _unlimited(run: Observation, motor: Fault, starts: Sequence[int]) -> list[tuple[range, slice]]:
-    """Return the cycles in which the check of the joint speeds is off, and the joints of the leg with the motor fault.
+    """Return ranges of cycles, and the joints whose speed is not checked in each range.
 
-    Only the speeds of these joints are not checked.
+    The joints are those of the leg with the motor fault.
     Each range contains `FOUND` cycles with data of the faulty motor. The ranges begin with the fault and with each later START.
 
     Args:
@@ -271,7 +272,7 @@ def _unlimited(run: Observation, motor: Fault, starts: Sequence[int]) -> list[tu
 
 
 def _strength(motors: Sequence[Fault]) -> Vector:
-    """Return the factor by which motor faults can increase the torque of each motor, at least 1, shape (12,).
+    """Return, for each motor, the factor by which motor faults can increase its torque, at least 1, shape (12,).
 
     Args:
         motors: motor faults of the run.

@@ -15,7 +15,7 @@ from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState, Vector
 from atalante_tools.faults.command_check import Commands
 
-#: Number of consecutive cycles in ACTIVE after which the walk is considered restarted: a whole step of 0.8 s.
+#: Number of consecutive cycles in ACTIVE after which the walk counts as restarted. They last 0.8 s, one whole step.
 RESTARTED: Final = 800
 
 
@@ -46,7 +46,8 @@ class Observation:
     velocity: Vector  # true joint velocities [rad/s], shape (cycles, 12)
     temperature: Vector  # reported temperature of the drives [degC], shape (cycles, 12)
     age: npt.NDArray[np.int64]  # data age of each message in the HAL [cycles], shape (cycles, messages)
-    #: largest distance [rad] by which an assisted joint is outside its guide, shape (cycles,); negative: all are inside
+    #: largest distance by which an assisted joint is outside its guide [rad], shape (cycles,). A negative value means that all
+    #: assisted joints are inside their guides.
     guide_exit: Vector
     messages: tuple[str, ...]  # name of the message in each column of `age`
 
@@ -60,7 +61,7 @@ class Observation:
 
     @property
     def last_before_start(self) -> int:
-        """Return the last cycle before the operator presses START after the fault.
+        """Return the last cycle before the START that follows the fault.
 
         If START is not pressed after the fault, return the last cycle of the run.
         """

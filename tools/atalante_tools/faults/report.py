@@ -162,7 +162,7 @@ class Summary:
         return "\n\n".join([_table([head, *rows]), *(["\n".join(failed)] if failed else [])])
 
     def _pairs(self) -> str:
-        """Return a table of the final states of all fault pairs: a row per first fault, a column per second fault."""
+        """Return a table of the final states of all fault pairs: one row per first fault, and one column per second fault."""
         names = [f"{id_} {name}" for id_, name in REPRESENTATIVES]
         found = {(pair.first, pair.second): pair for pair in self.pairs}
         rows = [["", *(name.split()[0] for name in names)]]
@@ -188,7 +188,7 @@ def _moment_row(runs: Sequence[MomentVerdict]) -> list[str]:
 
 
 def survived(endurance: Endurance) -> str:
-    """Return the longest fault with which the walk continues [cycles], as text for a table.
+    """Return the longest fault duration that the walk survives [cycles], as text for a table.
 
     Args:
         endurance: result of the run.

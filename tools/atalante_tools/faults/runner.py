@@ -45,7 +45,7 @@ ASSISTANCE: Final = 0.5
 _START: Final = 600
 #: Number of cycles between two presses of START after the fault. The first press ends FAULT, the second press ends HOLD.
 RECOVERY: Final = 100
-#: Longest wait for ACTIVE after the START that ends HOLD [cycles]. After this wait, the run ends in any other state.
+#: Longest wait for ACTIVE after the START that ends HOLD [cycles]. If the HAL is not ACTIVE by then, the run ends.
 _RESTART: Final = 300
 
 

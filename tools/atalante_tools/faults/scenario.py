@@ -127,5 +127,5 @@ class Scenario:
 
     id: str
     cases: tuple[Case, ...]
-    #: Case with a permanent fault. The endurance run shortens this fault until the walk continues. None: no endurance run.
+    #: Case with a permanent fault. The endurance run shortens the fault until the walk continues. None means no endurance run.
     permanent: Case | None = None

@@ -17,9 +17,10 @@ _HOLD: Final = SupervisorState.HOLD
 _KNEE: Final = "LEFT_SK"
 #: Joint that hardly moves while the left leg swings, so that a small jump of the joint encoder is detectable.
 _STILL: Final = "RIGHT_FH"
-#: Probability that a frame arrives twice. The HAL tolerates this probability permanently. Above 0.2, the HAL reports F63.
+#: Probability that a frame arrives twice. The HAL tolerates `_OFTEN` permanently. Above 0.2, it reports fault F63.
 _OFTEN: Final = 0.15
-#: Part of a case name -> permanent communication fault during which the HAL must still detect a drifting encoder.
+#: Dictionary from a part of the case name to a permanent communication fault. During this fault, the HAL must still detect a
+#: drifting encoder.
 #: Two of these faults delay messages that the sensor checks use: the messages of a joint drive and of the pelvis IMU.
 #: Frames are doubled at random, because the HAL stops the walk if a message arrives twice in every cycle (fault F63).
 _TOLERATED: Final = {
@@ -106,7 +107,7 @@ SCENARIOS: Final = (
         "F27",
         (
             *(Case(node, _stuck(node, 200), node=node) for node in ("LEFT_SH", "RIGHT_SH")),
-            # With a stuck knee encoder, the guide commands the largest torque of the drive.
+            # If the knee encoder is stuck, the guide commands the largest torque of the drive.
             # At a large torque, the HAL detects a stuck encoder within 20 cycles.
             *(
                 Case(f"{_KNEE} at {phase:g} T", _stuck(_KNEE, 200), node=_KNEE, phase=phase, detected=20, reacted=20)
@@ -153,7 +154,7 @@ SCENARIOS: Final = (
                 # The HAL accepts a joint motion of at most 22.5 mrad within five cycles. Each of these jumps is larger.
                 for by in (0.025, -0.025, 0.1, -1.0)
             ),
-            # The drives begin to hold their position in the cycle in which the encoder jumps back.
+            # In the cycle in which the encoder jumps back, the drives begin to hold their position.
             *(
                 Case(f"{1e3 * by:g} mrad for 5 cycles", (Fault("encoder_jump", _STILL, 0, 5, by=by),), node=_STILL)
                 for by in (0.3, -0.3)

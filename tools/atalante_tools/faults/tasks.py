@@ -30,11 +30,12 @@ from atalante_tools.faults.verdict import (
     limit_violations,
 )
 
-#: Longest duration of a fault in an endurance run [cycles]. This duration is longer than a walking step.
+#: Longest duration of a fault in an endurance run [cycles]. It is longer than the duration of a walking step.
 HORIZON: Final = 1000
 #: Number of cycles between the first and the second fault of a pair.
 PAIR_DELAY: Final = 3
-#: Test cases for runs with two faults, as (fault ID, name of the test case). A campaign with pairs runs every pair of them.
+#: Test cases for runs with two faults, as (fault ID, name of the test case). A campaign with pairs runs
+#: every combination of two different test cases once.
 REPRESENTATIVES: Final = (
     ("F03", "4 frames"),
     ("F04", "LEFT_SK"),
@@ -93,7 +94,7 @@ class EnduranceTask:
     engine: str = PYBULLET
 
     def __call__(self) -> Endurance:
-        """Repeat the case with shorter and shorter faults until the walk continues. Return the duration of the last fault."""
+        """Repeat the case with shorter and shorter faults until the walk continues. Return the fault duration of the last run."""
         case = SCENARIOS[self.id].permanent
         assert case is not None
         case = replace(case, engine=self.engine)

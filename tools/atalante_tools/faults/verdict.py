@@ -60,7 +60,7 @@ class Expectation:
         if detected is None or reacted is None:
             raise ValueError(
                 f"{row.id} {case.name}: the time limit in the fault matrix must be a number of cycles, got {row.cycles!r}; "
-                "define `detected` and `reacted` in the case instead"
+                "define the time limits `detected` and `reacted` in the case"
             )
         state = row.state if case.state is None else case.state
         return cls(state, row.dtc if case.dtc is None else case.dtc, detected, reacted)
@@ -167,7 +167,7 @@ def limit_violations(
 
 
 def automatic_improvements(run: Observation, until: int, starts: Sequence[int] = ()) -> list[str]:
-    """Return a sentence if the HAL changed to a less severe state without the operator, after the first faulty cycle.
+    """Return a sentence if the HAL, after the first faulty cycle, changed to a less severe state without the operator.
 
     Each START may change the state only once, and within `ENABLE_CYCLES` cycles. READY to OFF is always accepted, because
     nothing moves.
@@ -239,7 +239,7 @@ def _reported(run: Observation, expected: Expectation) -> list[Event]:
 
 
 def _recovery(run: Observation, case: Case) -> list[str]:
-    # A case that begins at power-on skips this check, because the HAL itself changes to less severe states after power-on.
+    # Skip this check for a case that begins at power-on, because the HAL changes to less severe states by itself after power-on.
     found = [] if case.phase is None else automatic_improvements(run, run.last_before_start)
     if run.pressed is None:
         return found
