@@ -132,7 +132,7 @@ DEFAULT_STEP: Final = (0.15, 0.9)
 
 
 def length(text: str) -> float:
-    """Convert a length that the user typed to metres. For example, 1.75 and 175 both give 1.75 m.
+    """Convert the text of a length option to metres. For example, 1.75 and 175 both give 1.75 m.
 
     Args:
         text: Length of a body part or a step. Numbers below 5 are metres, other numbers are centimetres.

@@ -69,9 +69,9 @@ class _Leg:
         )
 
     def consecutive(self) -> npt.NDArray[np.bool_]:
-        """Return for each frame and joint whether two consecutive cycles enable the drive, shape (n - 1, 6).
+        """Return for each pair of successive frames and each joint whether both frames enable the drive, shape (n - 1, 6).
 
-        Element k is True if the frames k and k + 1 both enable the drive and belong to consecutive cycles.
+        Row k belongs to the frames k and k + 1. It is False if the two frames do not belong to consecutive cycles.
         """
         enabled = self.word == Controlword.ENABLE_OPERATION
         return np.asarray(enabled[1:] & enabled[:-1] & (np.diff(self.cycle) == 1)[:, None])

@@ -305,8 +305,8 @@ SCENARIOS: Final = (
         permanent=Case("permanent", (Fault("flags", _STATE, flags=_ERROR_PASSIVE),)),
     ),
     # A second sender copies the last frame of a node, changes signals of the copy, and adds `ahead` to its alive counter.
-    # If `ahead` is 1, the copy has the counter of the node's next frame. If `ahead` is 0, the copy has the
-    # counter of the node's last frame.
+    # If `ahead` is 1, the copy has the counter of the node's next frame. If `ahead` is 0, the copy has
+    # the counter of the node's last frame.
     Scenario(
         "F58",
         (

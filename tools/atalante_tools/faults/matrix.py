@@ -44,7 +44,7 @@ class Row:
 
     @property
     def detected(self) -> int | None:
-        """Return the cycle by which the diagnostic must be reported; None if the column Cycles contains no number.
+        """Return the cycle by which the diagnostic must be reported; None if `cycles` does not have the form "5" or "1 / 5".
 
         The first faulty cycle is cycle 1.
         """
@@ -53,7 +53,7 @@ class Row:
 
     @property
     def reacted(self) -> int | None:
-        """Return the cycle by which the reaction must occur; None if the column Cycles contains no number.
+        """Return the cycle by which the reaction must occur; None if `cycles` does not have the form "5" or "1 / 5".
 
         The first faulty cycle is cycle 1. In the text "1 / 5", the cycle of the reaction is 5.
         """

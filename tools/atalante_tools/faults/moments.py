@@ -46,7 +46,7 @@ SAG_MAX: Final = 1.0
 #: Codes of the events with which the HAL reports that a start ended without reaching ACTIVE.
 _ENDS_OF_START: Final = ("START_FAILED", "START_REFUSED")
 #: Largest accepted motion of a joint during a start [deg], for each kind of fault that moves joints during a start.
-#: This limit applies to all joints of a leg with the fault.
+#: Each limit applies to all joints of a leg with the fault.
 #: A faulty motor or an exchanged encoder moves a joint until the direction test at the end of the start detects the fault (F72).
 #: For a push, the motion has no limit, because a push may be stronger than the torque that holds the joint.
 SAG_OF: Final = {
@@ -58,7 +58,7 @@ SAG_OF: Final = {
     "value": 5.0,
     "push": math.inf,
 }
-#: Kinds of motor faults. Until the HAL finds a motor fault, the joints of the faulty leg may exceed their velocity limits.
+#: Kinds of motor faults. Until the HAL finds a motor fault, the joints of that leg may exceed their velocity limits.
 #: The speeds of these joints are not checked for `FOUND` cycles after the fault begins, and for `FOUND` cycles after each later
 #: START. Cycles in which the HAL receives no data of the drive do not count, because another fault hides the motor fault (see
 #: `_SILENT`).
@@ -252,8 +252,8 @@ def _motor_faults(stimuli: Sequence[Stimulus]) -> list[Fault]:
 def _unlimited(run: Observation, motor: Fault, starts: Sequence[int]) -> list[tuple[range, slice]]:
     """Return ranges of cycles, and the joints whose speed is not checked in each range.
 
-    The joints are those of the leg with the motor fault.
-    Each range contains `FOUND` cycles with data of the faulty motor. The ranges begin with the fault and with each later START.
+    The joints are those of the leg with the motor fault. Each range contains `FOUND` cycles with data of the faulty motor. The
+    ranges begin with the fault and with each later START.
 
     Args:
         run: observation of the run.

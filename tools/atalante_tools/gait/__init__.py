@@ -111,24 +111,24 @@ command.add_command(solve)
     "--thigh",
     type=levels_of,
     metavar="X,...",
-    help="Thigh lengths of the grid, as multiples of the usual length for the height (Winter's table), such as 0.94,1,1.06.",
+    help="Thigh lengths of the grid, as multiples of the length that Winter's table gives for the height, such as 0.94,1,1.06.",
 )
 @click.option(
     "--shank",
     type=levels_of,
     metavar="X,...",
-    help="Shank lengths of the grid, as multiples of the usual length for the height (Winter's table), such as 0.94,1,1.06.",
+    help="Shank lengths of the grid, as multiples of the length that Winter's table gives for the height, such as 0.94,1,1.06.",
 )
 @click.option(
     "--size",
     type=int,
     metavar="N",
-    help="Number of gaits: the corners of the grid, and points that fill the grid evenly. If N is "
-    "increased, the existing gaits are kept and further gaits are added.  [default: 1000]",
+    help="Number of gaits. They are the corners of the grid and points that are spread evenly in the grid. If N is increased, "
+    "the existing gaits are kept and further gaits are added.  [default: 1000]",
 )
 @json_option
 def library(out: Path, jobs: int, machine_code: bool, cluster: str | None, as_json: bool, **grid_options: Any) -> None:
-    """Solve gaits of a grid of patients, step lengths and step durations, and write a file per gait to DIR/gaits.
+    """Solve the gaits of a grid of patients, step lengths and step durations. Write one file per gait to DIR/gaits.
 
     After an interruption, the same command solves the missing gaits. A gait is also solved again if its file is damaged, was
     made by another version of the code, or belongs to another subject. Failed gaits are listed on stderr and in DIR/failed, and

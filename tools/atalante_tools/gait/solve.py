@@ -61,7 +61,7 @@ def solve(
     animate: Path | None,
     as_json: bool,
 ) -> None:
-    """Optimise the gait of a patient. If there is no gait, the exit code is 1 and stderr names the violated constraint.
+    """Optimise the gait of a patient. If no gait is found, the exit code is 1 and stderr names the violated constraint.
 
     If a periodic step fails, it is solved again. The second solve starts from the gait of the same patient with a moderate step.
     If the second solve fails too, stderr also names the joints that are at a limit.

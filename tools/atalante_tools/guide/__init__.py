@@ -52,13 +52,13 @@ class CheckOptions:
 
     shapes: tuple[str, ...]  # names or files of the guide shapes; empty means all shapes of the package
     factors: tuple[float, ...]  # assistance factors; empty means `FACTORS`
-    patients: bool  # whether to check the network gaits of several patients, too
+    patients: bool  # whether to also check the gaits that the gait network computes for several patients
     conditions: tuple[str, ...]  # names of deviations from the model, such as "friction"; empty means all deviations
     push: tuple[float, float] | None  # largest push at hip and knee [Nm]; None means the certified torques
     steps: int | None  # number of steps per guide on the ideal plant; None: 60 if `quick` is set, otherwise 1500
     robot_steps: int | None  # number of steps per guide on the emulated robot; None: 0 if `quick` is set, otherwise 60
     seed: int  # seed of the search and of the noise
-    quick: bool  # whether the search is short, with the settings `QUICK` instead of `COMPLETE`
+    quick: bool  # True: short search with the settings `QUICK`; False: the settings `COMPLETE`
     plot: Path | None  # picture file; None means no picture
     table: Path | None  # Markdown file for the table; None means no file
     results: Path | None  # file of the results; an interrupted check is resumed from this file; None means no file
@@ -78,7 +78,7 @@ class CheckOptions:
         )
 
     def task(self) -> dict[str, Any]:
-        """Return the options on which all verdicts depend. The first line of the results file contains these options."""
+        """Return the options that affect all verdicts. The first line of the results file contains these options."""
         return {
             "conditions": self.conditions,
             "effort": asdict(self.effort()),
@@ -108,11 +108,11 @@ _CHECK_OPTIONS = [
                  help="Steps on the emulated robot per guide.  [default: 60; with --quick: 0]"),
     click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the search and of the noise."),
     click.option("--quick", is_flag=True,
-                 help="Run a short search: with fewer steps, without pushes above the limits of --push, and without steps on the "
-                      "emulated robot (unless --robot-steps is given)."),
+                 help="Run a short search: fewer steps, no search for pushes above the push limits, and no steps on the emulated "
+                      "robot (unless --robot-steps is given)."),
     click.option("--plot", type=OutputFile(".png", ".svg", ".pdf"), metavar="FILE",
-                 help="Draw the last guide: its bounds, its worst step, and its safe area (safe backward image). From a "
-                      "tracking error in the safe area, the controller can still keep the joints inside the guide."),
+                 help="Draw the last guide: its bounds, its worst step, and its safe area (safe backward image). If a "
+                      "tracking error is in the safe area, the controller can still keep the joints inside the guide."),
     click.option("--table", type=OutputFile(".md"), metavar="FILE", help="Write the results as a Markdown table."),
     click.option("--results", type=OutputFile(".jsonl"), metavar="FILE",
                  help="Append each result to this file. Guides that the file already contains are not checked again, so the same "
@@ -286,12 +286,12 @@ def verdicts_table(verdicts: Sequence[Verdict]) -> str:
     default=120,
     show_default=True,
     metavar="N",
-    help="Number of steps that are simulated with each shape, on the ideal plant.",
+    help="Number of simulated steps per shape, on the ideal plant.",
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of shapes and search.")
 @json_option
 def random_command(count: int, first: int, steps: int, seed: int, as_json: bool) -> None:
-    """Check random guides. Their shapes are in turn smooth, notched (notches of 2 to 40 ms) and piecewise constant.
+    """Check random guides. Their shapes alternate: smooth, notched (notches of 2 to 40 ms), piecewise constant.
 
     Each guide has a random assistance factor up to 0.95. The adversary searches for the worst push up to the promise of the
     guide, on the ideal plant. The exit code is 1 if such a push moved a joint out of a certified guide.

@@ -31,7 +31,7 @@ from atalante_tools.guide.plant import HIP, KNEE, Condition, Plant, advance, inv
 
 Pair = tuple[float, float]
 
-#: A step ends early if |e| / q_bound exceeds this value, because the joint is then far outside the guide.
+#: Largest ratio |e| / q_bound. Above this ratio, the joint is far outside the guide, and the step ends early.
 FAR_OUTSIDE = 8.0
 #: Columns of `Walked.log`.
 LOG = (
@@ -46,9 +46,9 @@ LOG = (
     "rate_hip",
     "rate_knee",
 )
-#: Number of values that can set the sign of a push (`Push.feedback`): tracking error and error rate, each of hip and knee.
+#: Number of features that can set the direction of a push (`Push.feedback`): tracking error and error rate of hip and knee.
 FEATURES = 4
-#: Unit of the error rate in `Push.feedback` [rad/s]: a rate of 0.5 rad/s counts as 1.
+#: Divisor that scales the error rate in `Push.feedback` [rad/s]. An error rate of 0.5 rad/s gives the feature value 1.
 RATE = 0.5
 
 
@@ -60,7 +60,7 @@ class Push(NamedTuple):
     error.
     """
 
-    signs: Vector  # planned direction, positive or negative, in each cycle (row) at hip and knee (columns); shape (cycles + 1, 2)
+    signs: Vector  # sign of the planned direction, one row per cycle, columns: hip and knee; shape (cycles + 1, 2)
     #: weights of the `features`: one row for each joint (hip, knee), one column for each feature; shape (2, FEATURES)
     feedback: Vector
 
@@ -71,9 +71,9 @@ class Start(NamedTuple):
     deviation: Pair  # angle minus nominal angle, of hip and knee [rad]
     rate: Pair  # speed minus nominal speed, of hip and knee [rad/s]
     #: Torque jump at the stance change, of hip and knee [Nm].
-    #: It is the motor torque before the stance change, minus the torque that gives the nominal acceleration afterwards.
+    #: The jump is the motor torque before the stance change minus the torque that gives the nominal acceleration after it.
     carried: Pair
-    ahead: Pair  # real speed minus measured speed, of hip and knee [rad/s]; a filter delays the measured speed
+    ahead: Pair  # real speed minus measured speed of hip and knee [rad/s], caused by the delay of the measurement
 
 
 class Goal(NamedTuple):
@@ -91,7 +91,7 @@ class Walked(NamedTuple):
     ratio: float  # largest ratio |e| / q_bound of the step; above 1: a joint was outside the guide
     cycle: int  # cycle with the largest ratio |e| / q_bound
     joint: int  # joint with the largest ratio |e| / q_bound: 0 for the hip, 1 for the knee
-    log: Vector  # values of each cycle, shape (cycles + 1, len(LOG)); zero after an early end of the step
+    log: Vector  # values of each cycle, shape (cycles + 1, len(LOG)). If the step ends early, the remaining rows are zero.
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class IdealLeg:
         x: Vector = np.minimum(time / end, 1.0)[:, None]
         #: Nominal angles [rad], speeds [rad/s] and accelerations [rad/s2] of hip and knee, each of shape (cycles + 1, 2).
         self.nominal: tuple[Vector, Vector, Vector] = motion(coefficients, duration, phase)
-        # The desired motion leads from the start state back to the nominal motion, which it reaches at the time `end`.
+        # The desired motion begins at the start state and reaches the nominal motion at the time `end`.
         # Remaining angle deviation = angle deviation at the start * `_s[0]` + speed deviation at the start * `_s[1]`.
         self._s = 1.0 - 3.0 * x**2 + 2.0 * x**3, end * (x - 2.0 * x**2 + x**3)
         # `_sd` is the time derivative of `_s`.
@@ -189,7 +189,7 @@ class IdealLeg:
         return Walked(float(ratio), int(cycle), int(joint), log)
 
     def image(self, start: Start) -> Vector:
-        """Return the largest tracking errors from which the controller can still keep both joints inside the guide.
+        """Return the largest tracking errors at which the controller can still keep both joints inside the guide.
 
         For such an error, the safety value h is at least 0, so the backup policy can keep both joints inside the guide. Only the
         angle of one joint deviates from the desired motion. The angle of the second joint and both speeds do not deviate. The set
@@ -225,7 +225,7 @@ class Episode(NamedTuple):
     goal: Goal
     push: Push
     box: Vector  # largest push at hip and knee [Nm], shape (2,)
-    #: encoder noise [rad], and random numbers that select lost frames, see `noise_of`; shape (cycles + 1, 4)
+    #: result of `noise_of`: encoder noise [rad] and random numbers that select lost frames, shape (cycles + 1, 4)
     noise: Vector
     before: Vector  # torque before the stance change [Nm], shape (2,)
     #: Angles of the twelve joints [rad], then their speeds [rad/s], shape (24,).
@@ -235,7 +235,7 @@ class Episode(NamedTuple):
 
 
 def noise_of(cycles: int, condition: Condition, generator: np.random.Generator) -> Vector:
-    """Draw encoder noise [rad] (columns 0 and 1) and numbers in [0, 1] that decide about lost frames (columns 2 and 3).
+    """Draw encoder noise [rad] (columns 0 and 1) and numbers in [0, 1) for the choice of lost frames (columns 2 and 3).
 
     Args:
         cycles: number of cycles in a step.
@@ -319,7 +319,7 @@ def walk_step(
 
 
 def safe_errors(goal: Goal, row: Vector, image: Vector, measured: Measured, guide: GuideTables, parts: Parts) -> None:
-    """Find the largest tracking errors from which the controller can still keep both joints inside the guide.
+    """Find the largest tracking errors at which the controller can still keep both joints inside the guide.
 
     A bisection finds the errors of each joint at every tenth cycle. An error is safe if the controller returns h >= 0. Then the
     backup policy can keep both joints inside the guide.

@@ -48,7 +48,7 @@ class Condition:
     noise: float = 0.0  # noise of the joint encoders [rad rms]
     #: Probability that the measurements of a cycle are lost. The commands of a cycle are lost with the same probability.
     loss: float = 0.0
-    delay: int = 0  # further delay of a command [cycles]; with 0, a command acts one cycle after it is computed
+    delay: int = 0  # additional delay of a command [cycles]; if 0, a command acts one cycle after it is computed
 
     def __str__(self) -> str:
         """Return the deviations as text, for example "friction +20 %, 1 ms delay". The text for no deviation is "as modelled"."""
@@ -64,23 +64,23 @@ class Condition:
 class Plant(NamedTuple):
     """Constants of the plant for compiled functions. Index 0 is the hip, index 1 the knee."""
 
-    #: Mass matrix of hip and knee [kg m2]: coefficients a, b, c of the element M11, then of M12, then of M22, shape (3, 3).
+    #: Mass matrix of hip and knee [kg m2]. Rows: the elements M11, M12 and M22. Columns: the coefficients a, b, c. Shape (3, 3).
     #: An element of the mass matrix is a + b cos(knee angle) + c sin(knee angle).
     mass: Vector
-    #: Gravity torques [Nm]: coefficients a, b, c, d of the torque at the hip, then of the torque at the knee, shape (2, 4).
+    #: Gravity torques [Nm]. Rows: hip and knee. Columns: the coefficients a, b, c, d. Shape (2, 4).
     #: A gravity torque is a cos(q_SH) + b sin(q_SH) + c cos(q_SH + q_SK) + d sin(q_SH + q_SK).
     weight: Vector
     coulomb: Vector  # dry friction [Nm], shape (2,)
     viscous: Vector  # viscous friction [Nm s/rad], shape (2,)
     friction_speed: float  # speed at which dry friction reaches 76 % of its full value [rad/s]
-    tracking: float  # in each cycle, the motor torque moves this fraction of the way to the command, 0 to 1
+    tracking: float  # change of the motor torque in a cycle, divided by its distance to the command, 0 to 1
     keep: float  # weight of the old value in the velocity filter, 0 to 1
     torque_max: Vector  # torque limit of the limiter [Nm], shape (2,)
     torque_step: Vector  # largest change of the command in a cycle [Nm], shape (2,)
     velocity_max: Vector  # speed above which the limiter reduces the torque [rad/s], shape (2,)
     #: width of the speed range above `velocity_max` in which the limiter reduces the torque to zero [rad/s]
     velocity_margin: float
-    delay: int  # further delay of a command [cycles]; with 0, a command acts one cycle after it is computed
+    delay: int  # additional delay of a command [cycles]; if 0, a command acts one cycle after it is computed
     #: Probability that the measurements of a cycle are lost. The commands of a cycle are lost with the same probability.
     loss: float
 

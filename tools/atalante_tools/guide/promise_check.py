@@ -34,7 +34,7 @@ from atalante_tools.guide.search import DIRECTIONS, Adversary, Tried
 
 Pair = tuple[float, float]
 
-#: Value of the option --condition -> deviations from the model of the controller. The search tries all these deviations.
+#: Deviations from the model of the controller, by value of the option --condition. The search tries all these deviations.
 #: For example, the value "friction" stands for two deviations: 80 % and 120 % of the modelled friction.
 CONDITIONS: Final = {
     "model": (Condition(),),
@@ -56,10 +56,10 @@ PATIENTS: Final = (
 _CORNERS: Final = 64
 #: Lag of the measured velocity of a drive [s], caused by the low-pass filter and by the sampling (half a cycle).
 _VELOCITY_LAG: Final = 2.0e-3
-#: Largest factor on the push limits in the search for the smallest push that moves a joint out of the guide.
+#: Largest multiple of the push limits that is tried in the search for the smallest push that moves a joint out of the guide.
 LARGEST_FACTOR: Final = 6.0
-#: For each factor, the search simulates `_SHARE` times `Effort.steps` steps, but at least ten.
-#: If `Effort.steps` is 1500, each factor gets 150 steps.
+#: Share of `Effort.steps` that the search simulates for each multiple of the push limits: 150 of 1500 steps. The minimum is
+#: 10 steps.
 _SHARE: Final = 0.1
 
 
@@ -99,18 +99,18 @@ class Verdict:
     gait: str
     certified: bool
     #: Push limit at the hip [Nm]: `Task.push` if the task has one, otherwise the certified torque.
-    #: None if the guide has no certified torques and `Task.push` is None. No push was then tried.
+    #: None if the guide has no certified torques and `Task.push` is None. In this case, no push was tried.
     promise_hip_nm: float | None
     #: Push limit at the knee [Nm], see `promise_hip_nm`.
     promise_knee_nm: float | None
-    worst_ratio: float | None  # larger one of `plant_ratio` and `robot_ratio`; None if no step was simulated
+    worst_ratio: float | None  # maximum of `plant_ratio` and `robot_ratio`; None if no step was simulated
     steps: int  # total number of steps on the ideal plant and on the emulated robot
     plant_ratio: float | None  # largest ratio |e| / q_bound on the ideal plant; None if no step was simulated
     robot_ratio: float | None  # largest ratio |e| / q_bound on the emulated robot; None if the robot was not used
     worst_push: str  # kind of the worst push on the ideal plant, for example "constant" or "bang-bang"
     worst_condition: str  # deviation of the plant from the model in the worst step, for example "friction +20 %"
     stopped: str  # reason why the robot left ACTIVE; empty if the robot stayed in ACTIVE
-    #: smallest multiple of the push limits with which a joint left the guide, such as 1.3; None if not searched or not found
+    #: smallest multiple of the push limits that moved a joint out of the guide, such as 1.3; None if not searched or not found
     left_at: float | None
     reason: str  # what limits the certified torques, or why there are none
 
@@ -126,12 +126,12 @@ class Checked:
 
     verdict: Verdict
     leg: IdealLeg  # simulated leg that swings in the guide
-    #: step on the ideal plant with the largest |e| / q_bound; None if there was no search, because there were no push limits
+    #: step on the ideal plant with the largest |e| / q_bound; None if the check had no push limits and therefore no search
     worst: Tried | None
 
 
 def setup_of(subject: Subject | None, robot: Robot, config: AirwalkConfig | None = None) -> Setup:
-    """Return gait, robot and model, the inputs of a check.
+    """Return gait, robot and model for a check.
 
     The gait is the default gait, or the gait that the gait network computes for the subject.
 
@@ -238,7 +238,7 @@ def _on_robot(robot: PushedRobot, box: Pair, found: Sequence[Tried], task: Task)
     each = -(-task.effort.robot_steps // len(conditions))
     walks = []
     for number, condition in enumerate(conditions):
-        first = number * each % len(pushes)  # rotate the list of pushes, so that the walks begin at different pushes
+        first = number * each % len(pushes)  # rotate the list of pushes, so that the walks begin with different pushes
         walks.append(robot.walk(box, [*pushes[first:], *pushes[:first]], condition, each, seed + number))
     stopped = next((walk.stopped for walk in walks if walk.stopped), "")
     return RobotWalk(tuple(step for walk in walks for step in walk.steps), stopped)

@@ -21,7 +21,7 @@ from atalante_tools.faults.reachability.search import Exploration, Transition, e
 
 #: Controlword that CiA 402 does not define.
 UNKNOWN_WORD: Final = 0x55
-#: Errors that the search injects. Each entry has the error code, and whether the cause of the error persists.
+#: Errors that the search injects, as (error code, True if the cause of the error persists).
 #: Each `FaultReaction` of a drive is triggered by at least one of these errors.
 _ERRORS: Final = (
     (emergency.CURRENT, False),
@@ -29,7 +29,7 @@ _ERRORS: Final = (
     (emergency.UNDER_VOLTAGE, True),
     (emergency.COMMAND_REJECTED, False),
 )
-#: Cycle number used in all steps of the search. Any number gives the same results.
+#: Cycle number used in all steps of the search. The results of the search do not depend on it.
 _CYCLE: Final = 1000
 _POWERED: Final = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _OFF_WORDS: Final = (Controlword.DISABLE_VOLTAGE, Controlword.SHUTDOWN, Controlword.SWITCH_ON)
@@ -43,7 +43,7 @@ class Drive(NamedTuple):
     """State of a drive between two cycles."""
 
     state: DriveState
-    latched: bool  # whether the drive left OPERATION ENABLED without a command; it then ignores ENABLE OPERATION
+    latched: bool  # whether the drive left OPERATION ENABLED without a command, so that it ignores ENABLE OPERATION
     missed: int  # age of the last valid command [cycles]; ages above `WATCHDOG` are stored as `WATCHDOG`
     unsynced: int  # number of consecutive cycles without SYNC; numbers above `WATCHDOG` are stored as `WATCHDOG`
     errors: tuple[int, ...]  # codes of the errors whose cause persists
@@ -91,7 +91,7 @@ class DriveSteps:
         self._word, self._target, self._limit = np.zeros((3, count))
 
     def search(self) -> Exploration[DriveStep, DriveCycle]:
-        """Search for a drive that is enabled without commands, loses power without a cause, or ends a hold without QUICK_STOP."""
+        """Search for a violation of `WATCHDOG_PROPERTY`, `HOLD_PROPERTY` or `LATCH_PROPERTY`."""
         start = Drive(DriveState.SWITCH_ON_DISABLED, False, WATCHDOG, 0, ())
         return explore([DriveStep(start)], self._successors)
 

@@ -36,13 +36,13 @@ _S = SupervisorState
 NOTHING, RELEASED, STOPPED, HELD = range(4)
 #: Value of `Inputs.stop` after the HAL has received HOLD. `HELD` (3) has another meaning: the operator has pressed HOLD.
 RECEIVED_HOLD: Final = 2
-#: If no new pendant frame arrives after a stop action, the HAL may still enable a drive for this number of cycles.
+#: Number of cycles for which the HAL may still enable a drive after a stop action, if no new pendant frame arrives.
 SILENT_PENDANT: Final = LOST - 1
 #: Ages of late pendant frames that the search tries [cycles].
-#: From age `LOST` on, the data of the frame has timed out. From age 16 on, the E2E check rejects the frame.
+#: At age `LOST` or above, the data of the frame has timed out. At age 16 or above, the E2E check rejects the frame.
 _LATE: Final = (*range(1, LOST + 2), 16)
 _BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
-#: Largest stored number of cycles since the stop action. Larger numbers are stored as this number.
+#: Largest stored number of cycles since the stop action. Larger numbers are stored as `_LONG`.
 _LONG: Final = 6
 STOP_PROPERTY: Final = "no torque command after the dead-man switch is released, or after STOP or HOLD is pressed"
 MOVE_PROPERTY: Final = "each press of START causes at most one change to a better state"
@@ -60,13 +60,13 @@ class Operator(NamedTuple):
 
 
 class Presses(NamedTuple):
-    """Presses of START that have not changed the supervisor state yet.
+    """Presses of START, as long as they have not changed the supervisor state.
 
     The search `moves` checks its properties with these values.
     """
 
-    received: int = 0  # number of presses of START that were received but have not begun a start; 2 means two or more
-    started: bool = False  # whether a start is in progress that has not changed the supervisor state yet
+    received: int = 0  # number of received presses of START that have not begun a start yet; 2 means two or more
+    started: bool = False  # whether a start is in progress; a change of the supervisor state clears the flag
 
 
 class StopState(NamedTuple):
@@ -99,7 +99,7 @@ class Cycle(NamedTuple):
     operator: Operator = Operator()
 
 
-#: All results that pendant frames can have in one cycle: result -> one example of frames that cause the result.
+#: Dictionary from each possible result of the reception in one cycle to one example of pendant frames with this result.
 #: A result has three parts: state of the reception, inputs of the operator, and whether the HAL received a genuine START.
 #: A genuine START is a press of START from the pendant, not from a second sender.
 _Receptions = dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]
@@ -135,7 +135,7 @@ class OperatorPath:
         self._decided, self._commanded = cache(self._decide), cache(self._command)
 
     def stops(self) -> Exploration[StopState, Cycle]:
-        """Search for a drive that the HAL still enables `SILENT_PENDANT` or more cycles after a stop action of the operator."""
+        """Search for a drive that the HAL enables although the operator's stop action is at least `SILENT_PENDANT` cycles old."""
         return explore([StopState(*state) for state in _INITIAL], self._stop_successors)
 
     def moves(self) -> Exploration[MoveState, Cycle]:
@@ -219,7 +219,7 @@ class OperatorPath:
 
 
 def is_move(before: SupervisorState, after: SupervisorState) -> bool:
-    """Return whether a state change starts motion, or leads from a state worse than ACTIVE to a better state.
+    """Return True if a state change starts motion, or leads from a state worse than ACTIVE to a better state.
 
     The numbers of `SupervisorState` increase from the best to the worst state.
     """

@@ -33,27 +33,27 @@ from atalante_tools.faults.reachability.no_bus import NoBus
 
 #: Age at which pendant data times out [cycles of 1 ms]. The search does not distinguish higher ages.
 LOST: Final = atalante_dbc.load().message("PENDANT_STATE").timeout_ms
-#: Cycle number that each step uses. All counters are relative to this number, so its value does not affect the results.
+#: Cycle number used in all steps of the search. All counters are relative to `_CYCLE`, so the results do not depend on it.
 _CYCLE: Final = 1001
 _TAG: Final = _CYCLE & 0xFF
 #: `_PRESSES` is the RequestCounter in the last accepted frame of the pendant.
 #: `_ROGUE_PRESSES` is the RequestCounter in a frame in which a second sender reports a press.
 _PRESSES, _ROGUE_PRESSES = 10, 12
-#: Time in which a pressed START can still change the supervisor state: no time, one cycle, or several cycles.
+#: Codes of the remaining time in which a pressed START can change the supervisor state: none, one cycle, several cycles.
 NO_START, LAST_START, START = 0, 1, 2
-#: `NO_START`, `LAST_START` or `START` -> number of cycles in which a pressed START can still change the supervisor state.
-#: The search writes the number from `START_CYCLES` into `SafetyMonitor.start_cycles_left`.
+#: Remaining number of cycles in which a pressed START can change the supervisor state, by code (`NO_START`, ...).
+#: The search writes this number into `SafetyMonitor.start_cycles_left`.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
-#: Error counters of the pendant (`Qualification`) that the search tries. Key: True if the HAL trusts the pendant.
+#: Error counters of the pendant (`Qualification`) that the search tries. The key is True if the HAL trusts the pendant.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, 0, True)),
 }
 #: Last frame that the HAL checked for a press of a button. `_NONE`: no frame. `_LATEST`: the last accepted frame.
 #: `_OLDER`: a frame before the last accepted frame. `_ROGUE`: a frame of a second sender.
-#: If the next frame has another RequestCounter than the checked frame, a button was pressed.
+#: If the RequestCounter of the next frame differs from the RequestCounter of the checked frame, a button was pressed.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
-#: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE` -> RequestCounter (counter of button presses) in the checked frame.
+#: RequestCounter (counter of button presses) in the checked frame, by code (`_NONE`, `_LATEST`, `_OLDER`, `_ROGUE`).
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
 
@@ -65,7 +65,7 @@ class Reception(NamedTuple):
     request: int = Request.START  # `Request` of the last accepted frame
     evaluated: int = _LATEST  # last frame that the HAL checked for a press: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE`
     rogue: bool = False  # whether the last accepted frame has the RequestCounter of a second sender
-    stored: bool = False  # whether a START is stored until the pendant is trusted
+    stored: bool = False  # whether a press of START is stored until the HAL trusts the pendant
     trusted: bool = True  # whether the HAL trusts the pendant
     #: `Request` in the last intact frame of the genuine pendant, not of a second sender
     own_request: int = Request.START
@@ -100,7 +100,7 @@ class Supervision(NamedTuple):
     """
 
     supervisor: SupervisorState
-    start: int  # time in which a pressed START can still take effect: `NO_START`, `LAST_START` or `START`
+    start: int  # remaining time in which a pressed START can take effect: `NO_START`, `LAST_START` or `START`
     enabling: bool = False  # whether drives are being enabled (`SafetyMonitor.enabling`)
     lowered: bool = False  # whether the HAL keeps the left frontal hip drive off, so that its joint sinks
 
@@ -128,7 +128,7 @@ class _ScriptedPendant(Pendant):
     """Pendant that returns the inputs which the search has set."""
 
     def evaluate(self, present: bool, **others: object) -> None:
-        """Leave the operator's inputs as the search has set them.
+        """Do nothing. The search has already set the inputs of the operator.
 
         Args:
             present: has no effect.
@@ -161,7 +161,7 @@ class HalSteps:
         values, layout = self._parts.values, self._parts.layout
         self._drive_state, self._torque = values[layout["drive_state"]], values[layout["torque"]]
         self._frame = cache(self._sealed)
-        #: `_receive`, `_process` and `_without_press` with a cache of all results.
+        #: `_receive` and `_without_press` with a cache of all results. `_processed` is the cached form of `_process`.
         self.receive, self.without_press = cache(self._receive), cache(self._without_press)
         self._processed = cache(self._process)
 
@@ -334,9 +334,9 @@ class HalSteps:
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_cycles_left, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
-        monitor.recalled = -RECALL_CYCLES  # as if QUICK_STOP was sent long ago, so that ACTIVE is not delayed
-        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search does not count:
-        # in each cycle, it tries both possible results: the start ends (`LAST_START`), and the start continues (`START`).
+        monitor.recalled = -RECALL_CYCLES  # cycle of the last QUICK_STOP, long ago, so that ACTIVE is not delayed
+        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search does not count.
+        # Instead, it tries both results in each cycle: the start ends (`LAST_START`), and the start continues (`START`).
         monitor._stalled = 0
         monitor._ending = monitor._duplicate_found = monitor._ramping = monitor._proof_begun = False
         monitor.lowered.clear()

@@ -73,7 +73,7 @@ def drive_case_of(trace: Sequence[tuple[DriveCycle, DriveStep]]) -> Case:
     for cycle, _ in lost:
         if cycle != DriveCycle():
             raise NotReplayable(
-                f"the counterexample cannot be replayed: a lost command must be the only fault in each cycle, got {cycle}"
+                f"the counterexample cannot be replayed: each cycle must have exactly one fault, a lost command, got {cycle}"
             )
     return Case("counterexample", (Fault("drop", "COMMAND_LEFT_LEG", 0, len(lost)),), observed=OBSERVED)
 

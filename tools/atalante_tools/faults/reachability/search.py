@@ -21,7 +21,7 @@ class Transition(NamedTuple, Generic[S, L]):
 
 @dataclass(frozen=True)
 class Exploration(Generic[S, L]):
-    """Result of a search. `trace` lists the inputs and state of each cycle up to the first violation, or is empty."""
+    """Result of a search. `trace` lists inputs and state of each cycle up to the first violation; empty without violation."""
 
     states: int
     transitions: int
