@@ -42,7 +42,7 @@ _PRESSES, _ROGUE_PRESSES = 10, 12
 #: Codes of the remaining time in which a pressed START can change the supervisor state: none, one cycle, several cycles.
 NO_START, LAST_START, START = 0, 1, 2
 #: Remaining number of cycles in which a pressed START can change the supervisor state, by code (`NO_START`, ...).
-#: The search writes this number into `SafetyMonitor.start_cycles_left`.
+#: The search writes the number of cycles into `SafetyMonitor.start_cycles_left`.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
 #: Error counters of the pendant (`Qualification`) that the search tries. The key is True if the HAL trusts the pendant.
 QUALIFICATIONS: Final = {
