@@ -27,7 +27,7 @@ class RandomGuide(NamedTuple):
 
 
 def random_guide(seed: int, number: int) -> RandomGuide:
-    """Return the random guide shape with a given index, and an assistance factor. Consecutive shapes differ in kind.
+    """Return the random guide with a given index: a shape and an assistance factor. Consecutive shapes differ in kind.
 
     Args:
         seed: seed that all guides share.
@@ -64,7 +64,7 @@ def _waves(phase: Vector, sizes: Vector, shifts: Vector) -> Vector:
 
 
 def _notched(generator: np.random.Generator) -> Callable[[Vector], Vector]:
-    """Return a guide width as a function of the phase: constant except in one to four notches of 0.2 to 5 % of the step."""
+    """Return a guide width as a function of the phase: constant, with one to four notches of 0.2 to 5 % of the step each."""
     width, count = float(generator.uniform(0.5, _WIDE)), int(generator.integers(1, 5))
     centres, lengths = generator.random(count), 0.5 * 10.0 ** generator.uniform(-2.7, -1.3, count)
     depths = generator.uniform(_NARROW, 0.9, count)

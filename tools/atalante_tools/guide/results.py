@@ -23,7 +23,7 @@ class Results:
     """Verdicts of a check, and the file that contains them."""
 
     def __init__(self, path: Path | None, task: Mapping[str, Any]) -> None:
-        """Read the verdicts of an earlier run. A file that does not exist is created with the first verdict.
+        """Read the verdicts of an earlier run. A missing file is created when the first verdict is stored.
 
         The last line is incomplete if an earlier run was killed while it wrote this line. An incomplete last line is removed
         from the file.

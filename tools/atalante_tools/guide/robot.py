@@ -39,8 +39,8 @@ _LEG: Final = len(LEG_JOINTS)
 _MASSES: Final = (
     "pelvis_mass", "frontal_hip_mass", "transverse_hip_mass", "thigh_mass", "shank_mass", "ankle_mass", "foot_mass",
 )  # fmt: skip
-#: Command messages: `Condition.delay` delays all of their frames. `Condition.loss` drops some of their frames, and some state
-#: messages of the drives.
+#: Command messages. `Condition.delay` delays all frames of these messages.
+#: `Condition.loss` drops random frames of these messages and of the state messages of the drives.
 _COMMANDS: Final = ("COMMAND_LEFT_LEG", "COMMAND_RIGHT_LEG")
 
 
@@ -57,7 +57,7 @@ class RobotWalk:
     """Walk of the robot under pushes."""
 
     steps: tuple[RobotStep, ...]
-    stopped: str  # if the walk ended early: state of the HAL and reason; empty if all steps were walked
+    stopped: str  # state of the HAL and reason, if the walk ended early; empty if all steps were walked
 
     @property
     def worst(self) -> RobotStep | None:

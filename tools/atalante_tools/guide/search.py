@@ -39,9 +39,9 @@ DIRECTIONS: Final = tuple(itertools.product((1.0, -1.0), repeat=2))
 _STAGE, _BEAM = 40, 6
 #: Time over which the beam search extrapolates a tracking error with its current rate [s].
 _AHEAD: Final = 0.03
-#: `search` runs the beam search only if its budget is at least this number of simulated steps.
+#: Smallest budget with which `search` runs the beam search [simulated steps].
 _WITH_BEAM: Final = 1000
-#: `_identified` uses only the cycles in which |e| / q_bound of hip or knee exceeds this value.
+#: `_identified` uses a cycle only if |e| / q_bound of hip or knee exceeds `_ACTING` in this cycle.
 _ACTING: Final = 0.5
 #: Number of worst steps from which the local search chooses the next step to change.
 _PARENTS: Final = 6
@@ -55,7 +55,7 @@ class Tried(NamedTuple):
     start: Start
     push: Push
     condition: Condition
-    noise: int  # seed of encoder noise and lost frames
+    noise: int  # seed of the random encoder noise and of the random frame losses
     walked: Walked
 
 
@@ -222,7 +222,7 @@ class Adversary:
             )
 
     def _impulse_signs(self, joint: int, end: int, stiffness: Vector, damping: Vector) -> Vector:
-        """For each cycle before `end`, predict whether a torque in only this cycle raises or lowers the error in the cycle `end`.
+        """Predict whether a torque in a single cycle raises or lowers the error in the later cycle `end`.
 
         Args:
             joint: joint with the error: 0 for the hip, 1 for the knee.
@@ -231,8 +231,8 @@ class Adversary:
             damping: damping of the linear loop, shape (2, 2) [1/s].
 
         Returns:
-            1 if a short positive torque increases the error, -1 if the torque reduces the error. Shape (end, 2): the row is the
-            cycle of the torque, the column is the joint on which the torque acts (hip, knee).
+            1 if a positive torque in one cycle raises the error, -1 if the torque lowers the error. Shape (end, 2): the row is
+            the cycle of the torque, the column is the joint on which the torque acts (hip, knee).
         """
         step = np.block([[np.eye(2), 1e-3 * np.eye(2)], [-1e-3 * stiffness, np.eye(2) - 1e-3 * damping]])
         gain, signs = np.zeros(4), np.empty((end, 2))

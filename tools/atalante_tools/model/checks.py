@@ -16,8 +16,8 @@ from atalante_tools.session.body import engine_hint, no_banner
 #: Number of random states in which Pinocchio and PyBullet are compared.
 STATES = 100
 #: The model check compares torques and mass matrices from Pinocchio and PyBullet.
-#: The check fails if the relative difference between an array of Pinocchio and that of PyBullet is at least `AGREEMENT`.
-#: The relative difference is the largest difference of two corresponding elements, divided by the largest element.
+#: The check fails if the relative difference of two corresponding arrays is at least `AGREEMENT`.
+#: The relative difference is the largest difference of two elements, divided by the largest element of the Pinocchio array.
 AGREEMENT = 1e-6
 
 
@@ -31,7 +31,7 @@ class ModelCheck:
 
 
 def model_checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None) -> Iterator[ModelCheck]:
-    """Check total mass, mirror symmetry, positive inertias, and the agreement of Pinocchio and PyBullet on the URDF.
+    """Check total mass, mirror symmetry and inertias, and whether Pinocchio and PyBullet compute the same dynamics.
 
     Args:
         parameters: parameters of the exoskeleton.

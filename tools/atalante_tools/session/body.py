@@ -27,7 +27,7 @@ _NAMES: Final = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}
 
 
 def engine_hint() -> str:
-    """Return the commands that install a physics engine, with the Python version that PyBullet requires."""
+    """Return a text with the commands that install a physics engine, and the newest Python version with a PyBullet wheel."""
     python = sys.version_info[:2]
     newest = "{}.{}".format(*ENGINE_PYTHON)
     if python <= ENGINE_PYTHON:

@@ -10,7 +10,7 @@ from atalante_hal.bus import Bus
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.console.stop_request import StopRequest
 
-#: Longest wait for a frame [s]. After this time, clock, stop request and keyboard are checked.
+#: Longest wait for a frame [s]. After each wait, clock, stop request and keyboard are checked.
 POLL_TIMEOUT: Final = 0.02
 
 

@@ -20,9 +20,9 @@ from atalante_tools.console.terminal import print_message
 from atalante_tools.session.listening import POLL_TIMEOUT
 from atalante_tools.session.pendant_node import PendantNode, Request
 
-#: Shortest time for which a new pendant listens for another pendant before it sends [s].
+#: Shortest time for which a new pendant listens before its first frame [s].
 LISTEN: Final = 0.05
-#: Smallest number of SYNCs that a new pendant must receive before it sends.
+#: Smallest number of SYNCs that a new pendant must receive before its first frame.
 LISTEN_CYCLES: Final = 3
 #: Time without a SYNC after which the HAL is considered absent [s].
 HAL_TIMEOUT: Final = 1.0
@@ -35,8 +35,8 @@ PRESS_SYNCS: Final = 500
 STOP_SYNCS: Final = 20
 #: Number of SYNCs answered with a released dead-man switch at the end of `pendant start` and `pendant xi`.
 RELEASE_SYNCS: Final = 5
-#: Longest normal time from START to the state ACTIVE of the HAL [cycles].
-#: If the HAL has not changed its state within this time, the operator gets a message.
+#: Longest time from START to the HAL state ACTIVE in normal operation [cycles].
+#: If the HAL has not changed its state after `START_TIMEOUT`, the operator gets a message.
 START_TIMEOUT: Final = 400
 
 
@@ -73,7 +73,7 @@ class Session:
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
         self._hal_present, self._hal_found = True, False
-        # Total time without a HAL since the first SYNC [s]. If the HAL is absent now, the present absence is not included.
+        # Total duration of the ended absences of the HAL since the first SYNC [s]. An absence that still lasts is not included.
         self._absent = 0.0
         self._hal: object = None
         self._pressed_at: int | None = None

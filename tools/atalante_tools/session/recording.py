@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from atalante_tools.session.rig import Rig
 
 #: Longest wait for the telemetry process before a run in real time [s].
-#: A telemetry process that is not ready after this wait begins to record during the run, as soon as it is ready.
+#: After the wait, the run starts in any case. Recording begins as soon as the telemetry process is ready.
 _TELEMETRY_WAIT: Final = 5.0
 #: Time between two checks of the telemetry process [cycles].
 _TEND_CYCLES: Final = 250
@@ -93,7 +93,7 @@ def telemetry_cores(outputs: Outputs | None) -> int:
 
 
 def outlet_of(telemetry: Path | None) -> Mapping[str, Any]:
-    """Read the telemetry file. Return no fields if no file is given.
+    """Read the telemetry file, and return its fields. Without a file, return an empty mapping.
 
     Args:
         telemetry: TOML file with endpoint, TLS certificate and users.

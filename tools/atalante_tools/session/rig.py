@@ -46,10 +46,10 @@ UNCONFIRMED: Final = (
     "no HOLD was confirmed, because the bus is down: each enabled drive holds its position by itself after its watchdog "
     "timeout"
 )
-#: Longest wait for the answers to a SYNC in real time: half a cycle [s].
+#: Longest wait for the answers to a SYNC in real time [s], half a cycle.
 PATIENCE: Final = 0.5e-3
 #: Longest wait for the answers to a SYNC in lock-step [s].
-#: This wait is long, because the process of the emulated robot may run on a slow computer.
+#: `LOCKSTEP_PATIENCE` is large, because the process of the emulated robot may run on a slow computer.
 LOCKSTEP_PATIENCE: Final = 2.0
 
 
@@ -80,7 +80,7 @@ class Rig:
         record: Callable[[], None] = lambda: None,
         on_stop: Callable[[], None] | None = None,
     ) -> Statistics:
-        """Run the control loop on the clock of the target. A run in which the robot moved ends in HOLD.
+        """Run the control loop on the clock of the target. If the robot moved, the run ends in HOLD.
 
         On the wall clock, the process requests real-time priority and locked memory. After the first stop signal, the
         HAL rejects every START and changes to HOLD, and the run ends. Further signals do not interrupt this change. If

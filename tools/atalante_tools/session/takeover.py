@@ -1,4 +1,4 @@
-"""Takeover rule of the pendants: after any takeover exactly one pendant sends.
+"""Takeover rule of the pendants: after each takeover, exactly one pendant sends.
 
     SYNC and frames of other pendants -> PendantReader -> Takeover -> answer or silence
 
@@ -21,19 +21,19 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, MAX_DELTA, Check
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: A new pendant sends for at least this time [cycles]. In this time, the older pendant can fall silent.
+#: Shortest time for which a new pendant sends [cycles], so that the older pendant can fall silent.
 #: If the older pendant still sends after `TAKEOVER_CYCLES`, the new pendant may fall silent.
 TAKEOVER_CYCLES: Final = 50
-#: After a pendant has resumed sending, it must send for at least this time before it may stop again [cycles].
+#: Shortest time for which a pendant sends after it has resumed sending [cycles]. Then it may stop again.
 RETRY_CYCLES: Final = 8
 #: A random time of 0 to `DRAW_CYCLES` - 1 is added to `TAKEOVER_CYCLES` and to `RETRY_CYCLES` [cycles].
 DRAW_CYCLES: Final = 50
-#: A sending pendant falls silent and listens after this number of consecutive frames of another pendant.
+#: Number of consecutive frames of another pendant after which a sending pendant falls silent and listens.
 #: The HAL tolerates two senders for three cycles.
 PRESENT_FRAMES: Final = 2
-#: If a silent pendant receives this number of consecutive frames of another pendant, it gives up and never sends again.
+#: Number of consecutive frames of another pendant after which a silent pendant gives up. It then never sends again.
 LOST_FRAMES: Final = 3
-#: A silent pendant resumes sending if no frame of another pendant arrives for this time [cycles].
+#: Time without a frame of another pendant after which a silent pendant resumes sending [cycles].
 #: The HAL reports a timeout after 5 cycles without a frame.
 QUIET_CYCLES: Final = 3
 #: Results of the E2E check that count as an intact frame: the CRC is valid. The alive counter may have any value.

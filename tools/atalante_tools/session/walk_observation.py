@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from atalante_tools.session.rig import Rig
     from atalante_tools.session.walk_options import Push
 
-#: Period of the observation [cycles]. In this time, the pelvis of a falling robot turns by less than 2 degrees.
+#: Period of the observation [cycles]. During one period, the pelvis of a falling robot turns by less than 2 degrees.
 PERIOD_CYCLES: Final = 10
-#: After the HAL has left the state ACTIVE, the robot is observed for this time [cycles].
+#: Time for which the robot is observed after the HAL has left the state ACTIVE [cycles].
 #: If the robot stops in the middle of a step, more than 1.5 s can pass before it falls.
 AFTERMATH: Final = 5000
 _PELVIS: Final = IMUS.index("pelvis")

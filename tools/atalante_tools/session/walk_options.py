@@ -124,7 +124,7 @@ def sections_of(options: WalkOptions, robot: Robot) -> list[Section]:
 
 @cache
 def solved_gaits(subject: Subject, network: Path | None = None) -> WalkGaits:
-    """Return the gaits of a subject with the default limits of the joints. The gaits are computed once per process.
+    """Return the gaits of a subject, computed for the default joint limits. The gaits are computed once per process.
 
     Args:
         subject: Patient and step.

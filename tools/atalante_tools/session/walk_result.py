@@ -46,7 +46,7 @@ class WalkResult:
     promise_hip_nm: float | None
     #: Certified disturbance torque at the sagittal knee [Nm], see `promise_hip_nm`; None if no torques are certified.
     promise_knee_nm: float | None
-    max_ratio: float | None  # largest tracking error as a fraction of the guide width; None if no step was guided
+    max_ratio: float | None  # largest |e| / q_bound of both joints, as in `Result`; None if no step was guided
     inside: float | None  # fraction of the guided time with both joints inside the guide; None if no step was guided
     outside_cycles: int  # number of guided cycles with a joint outside the guide
     #: fraction of the guided time in which the backup torque of the guide (spring and damper) acts; None if no step was guided
@@ -58,10 +58,11 @@ class WalkResult:
     hand_overs_exceeded: int
     full_assist: bool  # whether a diagnostic made the HAL ramp the assistance factor to 1 (state FULL_ASSIST)
     lateral_m: float  # sideways deviation from the walking line at the last landing [m], positive to the left
-    yaw_deg: float  # heading of the soles relative to the walking line at the last landing [deg], left positive
-    #: true value of `lateral_m` at the end of the walk; None if the robot is real or fell
+    yaw_deg: float  # heading of the soles relative to the walking line at the last landing [deg], positive to the left
+    #: true sideways deviation from the initial walking line at the end of the walk [m]; None if the robot is real or fell
     true_lateral_m: float | None
-    true_yaw_deg: float | None  # true value of `yaw_deg` at the end of the walk; None if the robot is real or fell
+    #: true heading relative to the initial walking line at the end of the walk [deg]; None if the robot is real or fell
+    true_yaw_deg: float | None
     #: root mean square of the angle between true and estimated vertical during the walk [deg]; None if the robot is real
     attitude_rms_deg: float | None
     distance_m: float  # distance that the robot walked along the walking line [m]

@@ -23,7 +23,7 @@ from atalante_hal.wire.frame import Frames, as_words
 
 @dataclass
 class Fault:
-    """Fault of chosen messages. A fault ends when it has affected `frames` frames of each message, or when `end` is called."""
+    """Fault of some messages. A fault ends when it has affected `frames` frames of each message, or when `end` is called."""
 
     kind: str  # drop, delay or corrupt
     messages: tuple[str, ...]  # names of the messages

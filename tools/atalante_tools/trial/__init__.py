@@ -163,7 +163,7 @@ def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_jso
 @_walking()
 @_running("sweep")
 def sweep(days: int | None, walking: Walking, running: Running, as_json: bool) -> None:
-    """Run a series of walks of one active subject, of five minutes each.
+    """Run a series of five-minute walks of one active subject.
 
     Each walk begins with full assistance and ends with the assistance factor of the walk. From walk to walk, this factor falls
     from 1 to 0 and then rises to 1.
@@ -272,7 +272,7 @@ def protocol(
 @network_option
 @_running("robustness")
 def robustness(seeds: int | None, steps: int | None, network: Path | None, running: Running, as_json: bool) -> None:
-    """Walk at full assistance, with random patients, model errors, friction, late motors, lost frames and pushes.
+    """Walk at full assistance, with random patients, model errors, friction, delays, lost frames and pushes.
 
     If the robot does not complete all steps, or does not stand at the end, the trial is repeated, and its repetition is
     recorded in the folder `recordings`.
@@ -292,7 +292,7 @@ def robustness(seeds: int | None, steps: int | None, network: Path | None, runni
 @network_option
 @_running("pushes")
 def pushes(network: Path | None, running: Running, as_json: bool) -> None:
-    """Push the walking robot in 16 directions and at 8 phases of a step. The force rises until the robot falls.
+    """Push the walking robot in 16 directions and at 8 phases of a step. The force rises until the robot falls or stops.
 
     The report contains a polar figure of the largest push that the robot withstands.
     """

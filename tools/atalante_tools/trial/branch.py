@@ -1,4 +1,4 @@
-"""Branches of a run. A branch is a copy of the process that waits at one moment of the run.
+"""Branches of a run. A branch is a waiting copy of the process, forked at one moment of the run.
 
     run --fork--> waiting process --fork per request--> continued run -> answer
 

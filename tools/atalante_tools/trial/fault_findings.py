@@ -16,8 +16,7 @@ from atalante_tools.trial.findings import Finding, Result
 #: - lost, late and doubled frames, and errors on the bus;
 #: - a failed IMU, foot or force cell, and an exception of the controller;
 #: - a few late cycles, STOP, the release of the dead-man switch, and the loss of the pendant.
-#: In other cases of these faults, all drives hold their position immediately, so the robot may fall.
-#: `NO_FALL` does not contain the cases in which all drives hold their position immediately, for example:
+#: In other cases of these faults, all drives hold their position immediately, so the robot may fall. Examples:
 #: - The HAL loop stays much slower than 1 kHz. The joints then move too far in a cycle, and the HAL rejects their velocity.
 #: - A drive sends nothing for ten cycles. The HAL then does not know the angle of the joint.
 #: - The operator presses HOLD.
@@ -101,7 +100,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return as text the longest fault duration [cycles] that the robot withstands at every tested moment of the walk.
+    """Return the longest fault duration [cycles] that the robot withstands at every tested moment of the walk, as text.
 
     For example, the robot withstands a fault of 80 cycles in the weight shift, but only of 30 cycles at phase 0.375. The text is
     then "30 cycles (at phase 0.375)". If the robot withstands a permanent fault at all moments, the text is "is not limited".

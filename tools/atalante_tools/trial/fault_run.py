@@ -44,12 +44,12 @@ from atalante_tools.trial.plan import STEP
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: The walk is forked this number of cycles before the fault begins.
+#: Number of cycles from the fork of the walk to the first cycle of the fault.
 #: A fork one cycle before the fault would be too late: the emulated robot already has the frames of the first faulty cycle.
 _LEAD: Final = 5
 #: Number of cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
-#: Number of cycles after which a walk ends at the latest. A walk without a fault lasts about 10000 cycles.
+#: Largest number of cycles of a walk. A walk without a fault lasts about 10000 cycles.
 _LONGEST: Final = 20_000
 #: The robot is at rest if two conditions are true for `_RESTED` cycles:
 #: pelvis and joints are slower than `_STILL` [m/s, rad/s], and each foot carries a load of at least `_LOADED` [N].
@@ -61,7 +61,8 @@ _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
 _LANDED: Final = frozenset({Phase.STEP, Phase.STOP, Phase.BACK})
 _PELVIS: Final = IMUS.index("pelvis")
-#: A bisection finds the longest fault duration without a fall. The result is too short by at most this number of cycles.
+#: Resolution of the bisection for the longest fault duration without a fall [cycles]. The result may be too short, but not
+#: by more than `RESOLUTION`.
 RESOLUTION: Final = 10
 
 
@@ -127,7 +128,7 @@ def run_fault(trial: FaultTrial) -> dict[str, Any]:
 
 
 def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
-    """Return the longest duration of a fault without a fall [cycles], by bisection.
+    """Return the longest fault duration that the robot withstands without a fall [cycles], by bisection.
 
     Args:
         trial: trial of the case.
@@ -139,7 +140,7 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
 
     def falls(cycles: int) -> bool:
         # With the permanent fault, the robot falls after `fatal` cycles.
-        # A fault that lasts `fatal` cycles or longer equals the permanent fault up to the fall. So the robot falls with it, too.
+        # Up to the fall, a fault of at least `fatal` cycles has the effect of the permanent fault. So the robot falls, too.
         if cycles >= fatal:
             return True
         stimuli = tuple(limited(stimulus, cycles) for stimulus in case.stimuli)
@@ -149,7 +150,7 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
 
 
 def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int) -> int:
-    """Return the longest duration of a fault with which the robot does not fall, by bisection from 0 to `horizon`.
+    """Return the longest fault duration that the robot withstands without a fall, by bisection from 0 to `horizon`.
 
     The bisection assumes that the robot does not fall if there is no fault. It also assumes: if the robot falls with a fault of
     one duration, then the robot falls with every longer duration, too.

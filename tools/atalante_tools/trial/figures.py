@@ -20,7 +20,7 @@ _CONDITIONS: Final = ("passive full", "passive partial", "active full", "active 
 
 
 def shapes(results: Sequence[Result]) -> bytes:
-    """Draw the left hip over the phase, with one panel for each guide shape (figure "various shapes" of the paper).
+    """Draw the left hip angle over the phase, with one panel for each guide shape (figure "various shapes" of the paper).
 
     Args:
         results: results of `shape` trials.
@@ -84,7 +84,7 @@ def pushes(results: Sequence[Result]) -> bytes:
     ]
     axis.plot(angles, worst, linewidth=2.5, color="black", label="worst phase")
     axis.set(
-        theta_zero_location="N",  # forwards (0 degrees) points up in the plot, left (90 degrees) points left
+        theta_zero_location="N",  # 0 degrees (forwards) is at the top of the plot, 90 degrees (left) is at its left edge
         ylim=(0.0, None),
         title="largest push withstood [N]\n0 deg forwards, 90 deg to the left, right leg is stance leg",
     )
@@ -93,7 +93,7 @@ def pushes(results: Sequence[Result]) -> bytes:
 
 
 def joints(results: Sequence[Result], mass: float) -> bytes:
-    """Draw hip and knee of the left leg in the four trials of one subject (figure "active and passive" of the paper).
+    """Draw hip and knee angles of the left leg in the four trials of one subject (figure "active and passive" of the paper).
 
     Args:
         results: results of `assist` trials.

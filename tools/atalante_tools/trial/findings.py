@@ -23,7 +23,7 @@ Result = dict[str, Any]
 #: The last phase is 0.8, because a step with an early landing ends at a phase of about 0.9.
 _PHASES: Final = np.linspace(0.1, 0.8, 29)
 
-#: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
+#: Largest difference of two mean metabolic rates that count as equal, as a fraction of the rate of quiet standing.
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: `TREND`: Some values must fall as the assistance factor rises. Their rank correlation with the factor must be <= -`TREND`.
@@ -42,7 +42,7 @@ CERTIFIED, ROBUST = 0.95, 0.98
 #: `SIDEWAYS` applies if the heading comes from the gyro alone.
 #: `SIDEWAYS_WITH_REFERENCE` applies if the IMUs have a heading reference.
 SIDEWAYS, SIDEWAYS_WITH_REFERENCE = 1.5, 0.5
-#: The root mean square error of the estimated vertical must be below this angle in every walk [deg].
+#: Upper limit of the root mean square error of the estimated vertical in each walk [deg].
 ATTITUDE: Final = 0.5
 #: Push forces [N] that the robot must withstand at every phase of a step. A push lasts 0.2 s.
 #: `PUSH_WORST` applies to every direction, `PUSH_FORWARD` to a push forwards.
@@ -302,7 +302,7 @@ def _alarms(results: Sequence[Result]) -> str:
 
 
 def _net(result: Result) -> float:
-    """Return the metabolic rate with the assistance factor of the trial minus the rate with full assistance [W/kg]."""
+    """Return the metabolic rate [W/kg] in the last part of a walk, minus the rate in the part with full assistance."""
     return float(result["metabolic_w_kg"]["target"] - result["metabolic_w_kg"]["full"])
 
 

@@ -18,7 +18,7 @@ def _no_load(*feet: str) -> tuple[Fault, ...]:
 
 
 def _invalid(foot: str) -> Fault:
-    """Return a fault that sends the invalid code of the vertical force of all cells of a foot."""
+    """Return a fault in which all cells of a foot send the code that marks their vertical force as invalid."""
     message, signals = f"{foot}_STATE", [f"{cell}_ForceZ" for cell in CELLS]
     return Fault("raw", message, 0, None, **{signal: invalid_code(message, signal) for signal in signals})
 

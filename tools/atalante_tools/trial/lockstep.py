@@ -18,7 +18,7 @@ from atalante_tools.session.walk_observation import AFTERMATH, Observation
 from atalante_tools.session.walk_options import solved_gaits
 from atalante_tools.trial.plan import STEP, network_of
 
-#: If the robot is not ACTIVE after this time, the trial ends with the outcome "no start" [cycles].
+#: Longest time until the robot is ACTIVE [cycles]. After a longer time, the trial ends with the outcome "no start".
 _START: Final = 30_000
 
 

@@ -127,7 +127,7 @@ class WalkTrial:
 
 @dataclass(frozen=True)
 class RobustTrial:
-    """Walk of a robot that differs from its model. The walk has full assistance, lost frames, late motors and pushes."""
+    """Walk of a robot that differs from its model. The walk has full assistance, lost frames, delays and pushes."""
 
     kind: ClassVar[str] = "robust"
     number: int

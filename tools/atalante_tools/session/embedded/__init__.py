@@ -98,7 +98,7 @@ class EmbeddedRobot(Closing):
             process_group=0,
         )
         self._begun = False
-        # Close the copy of the child's socket in this process. Otherwise this process does not detect the end of the child.
+        # Close the child's socket in this process; the child has its own copy. An open copy would hide the end of the child.
         os.close(child_socket)
         self.bus = SharedBus("embedded", memory, parent_socket, 0)
         self.bus.patience = _PATIENCE
@@ -194,7 +194,7 @@ def cores_are_idle(others: int, load: Path = _LOAD) -> bool:
         except (OSError, IndexError, ValueError):
             return True  # if the load cannot be read, the cores are assumed to be idle
         time.sleep(_LOAD_INTERVAL)
-    busy = max(1, min(samples))  # smallest number of running threads in a sample; this thread is one of them
+    busy = max(1, min(samples))  # smallest number of running threads over all samples; this thread is counted, too
     return (os.cpu_count() or 1) - busy >= 1 + others
 
 

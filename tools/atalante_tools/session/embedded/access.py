@@ -1,4 +1,4 @@
-"""Access to an emulated robot without the bus: push its pelvis, turn the assistance dial, and read its true motion.
+"""Access to an emulated robot that bypasses the bus: push its pelvis, turn the assistance dial, and read its true motion.
 
     push, dial -> emulated robot -> true attitude of the pelvis, true position of the feet
 
@@ -42,7 +42,7 @@ class Stance(NamedTuple):
 
 
 class Access(Protocol):
-    """Access to an emulated robot without the bus: push its pelvis, turn the assistance dial, read its true motion."""
+    """Access to an emulated robot that bypasses the bus: push its pelvis, turn the assistance dial, read its true motion."""
 
     def push(self, wrench: Callable[[], Vector]) -> None:
         """Push the pelvis in every cycle from now on, with the wrench that the function `wrench` returns.
@@ -183,7 +183,7 @@ class RemoteAccess:
 
 
 class ServedAccess:
-    """Server in the process of the emulator: executes the requests of the `RemoteAccess` in the HAL process."""
+    """Server in the process of the emulator: executes the requests that the HAL process sends with its `RemoteAccess`."""
 
     def __init__(self, memory: int, emulator: Emulator, operator: Operator) -> None:
         """Attach to the memory that both processes share.
