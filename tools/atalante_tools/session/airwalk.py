@@ -200,7 +200,7 @@ def _walk_all(
                 if parallel and name != last:
                     robot_process = stack.enter_context(EmbeddedRobot(target.engine))
                 if telemetry is None:
-                    # The certificates are printed after the bus was opened. If the bus is missing, only the error is printed.
+                    # Print the certificates only when the bus is open. If the bus is missing, the user then sees only the error.
                     certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
                     announce(certificates.values(), controller.config.mismatch, "swing leg of the empty exoskeleton")
                     about = {"seed": options.seed, "steps": options.steps, "xi": options.xi, **asdict(options.law)}

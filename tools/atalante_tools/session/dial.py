@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Dial:
-    """Assistance dial of the emulated pendant. The emulated operator reduces the assistance factor from step to step."""
+    """Assistance dial of the emulated pendant. In the transition, the emulated operator reduces the factor before each step."""
 
     def __init__(self, operator: Operator | Access, protocol: tuple[int, int, int], xi: float) -> None:
         """Set the dial to full assistance.

@@ -60,8 +60,8 @@ class Rig:
     Attributes:
         target: Bus and clock.
         hal: HAL of the run.
-        access: Access to an embedded robot beside the bus, in this process or in another process. None if the robot is not
-            embedded.
+        access: Access to an embedded robot that bypasses the bus. The robot runs in this process or in another process. None if
+            the robot is not embedded.
         emulator: Emulator of a robot in this process. None if the robot is real or in another process.
         operator: Emulated operator of a robot in this process. None if the robot is real or in another process.
     """

@@ -37,7 +37,8 @@ class Result:
     promise_hip_nm: float | None
     promise_knee_nm: float | None  # certified torque at the knee [Nm], see `promise_hip_nm`
     steps: int  # number of completed right-stance steps (the left leg swings)
-    max_ratio: float | None  # largest |e| / q_bound: angle error, divided by the distance to the guide edge on its side
+    #: largest |e| / q_bound: angle error, divided by the distance from the desired angle to the guide edge
+    max_ratio: float | None
     inside: float | None  # share of the time with both assisted joints inside the guide, 0 to 1
     #: share of the time in which the backup torque of the guide (spring and damper) acts, 0 to 1
     filter_active: float | None

@@ -46,7 +46,9 @@ class WalkResult:
     promise_hip_nm: float | None
     #: Certified disturbance torque at the sagittal knee [Nm], see `promise_hip_nm`; None if no torques are certified.
     promise_knee_nm: float | None
-    max_ratio: float | None  # largest |e| / q_bound of both joints, as in `Result`; None if no step was guided
+    #: largest |e| / q_bound: angle error, divided by the distance from the desired angle to the guide edge;
+    #: None if no step was guided
+    max_ratio: float | None
     inside: float | None  # fraction of the guided time with both joints inside the guide; None if no step was guided
     outside_cycles: int  # number of guided cycles with a joint outside the guide
     #: fraction of the guided time in which the backup torque of the guide (spring and damper) acts; None if no step was guided

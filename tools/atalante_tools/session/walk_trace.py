@@ -89,7 +89,7 @@ def foot_prints(columns: Mapping[str, Vector]) -> list[tuple[int, float, float, 
 
 
 def draw(columns: Mapping[str, Vector], picture: Path) -> None:
-    """Draw the foot prints on the ground, and the angle errors of the swing leg over the time.
+    """Draw the foot prints on the ground, and the angle errors of the swing leg over time.
 
     The upper panel also shows the path of the divergent component of motion (DCM). The lower panel shows the angle errors of hip
     (SH) and knee (SK), each divided by the half-width of the guide. At 1 and -1, the joint is at an edge of the guide.

@@ -160,7 +160,7 @@ def power_and_error(results: Sequence[Result]) -> bytes:
 
 
 def scenario(result: Result) -> bytes:
-    """Draw the metabolic rate over the time of one trial (figure "testing procedure" of the paper).
+    """Draw the metabolic rate over time in one trial (figure "testing procedure" of the paper).
 
     Args:
         result: result of a walk.

@@ -53,7 +53,7 @@ _SH, _LEG = LEG_JOINTS.index("SH"), len(LEG_JOINTS)
 _RIGHT: Final = 1
 #: Smallest amplitude of a vibration motor that a subject feels in a trial with `haptics`, 0 to 1. The value is an assumption.
 _FELT_VIBRATION: Final = 0.1
-_SAMPLING = 20  # cycles between two samples of the motion
+_SAMPLING = 20  # number of cycles from one sample of the motion to the next
 #: Number of swings of the left leg whose curves are stored in a result.
 _CURVES: Final = 15
 #: Edges of the bins in a histogram of e / q_bound: the angle error of a joint, divided by the half-width of the guide.

@@ -64,7 +64,7 @@ class EmbeddedRobot(Closing):
 
     Attributes:
         bus: HAL side of the bus to the child.
-        access: Access to the robot beside the bus.
+        access: Access to the robot that bypasses the bus.
     """
 
     _open: ClassVar[list[EmbeddedRobot]] = []
