@@ -31,7 +31,7 @@ class ModelCheck:
 
 
 def model_checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None) -> Iterator[ModelCheck]:
-    """Check total mass, mirror symmetry and inertias, and whether Pinocchio and PyBullet compute the same dynamics.
+    """Check total mass, mirror symmetry, positive inertias, and that Pinocchio and PyBullet compute the same dynamics.
 
     Args:
         parameters: parameters of the exoskeleton.

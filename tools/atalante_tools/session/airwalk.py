@@ -200,7 +200,7 @@ def _walk_all(
                 if parallel and name != last:
                     robot_process = stack.enter_context(EmbeddedRobot(target.engine))
                 if telemetry is None:
-                    # Print the certificates only when the bus is open. If the bus is missing, the user then sees only the error.
+                    # Print the certificates only when the bus is open. If the bus is missing, only the error is printed.
                     certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
                     announce(certificates.values(), controller.config.mismatch, "swing leg of the empty exoskeleton")
                     about = {"seed": options.seed, "steps": options.steps, "xi": options.xi, **asdict(options.law)}

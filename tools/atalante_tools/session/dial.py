@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Dial:
-    """Assistance dial of the emulated pendant. In the transition, the emulated operator reduces the factor before each step."""
+    """Assistance dial of the emulated pendant. In the transition, the operator reduces the assistance factor in each step."""
 
     def __init__(self, operator: Operator | Access, protocol: tuple[int, int, int], xi: float) -> None:
         """Set the dial to full assistance.

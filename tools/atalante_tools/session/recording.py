@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from atalante_tools.session.rig import Rig
 
 #: Longest wait for the telemetry process before a run in real time [s].
-#: After the wait, the run starts in any case. Recording begins as soon as the telemetry process is ready.
+#: After the wait, the run starts even if the process is not ready. Recording then begins as soon as the process is ready.
 _TELEMETRY_WAIT: Final = 5.0
 #: Time between two checks of the telemetry process [cycles].
 _TEND_CYCLES: Final = 250

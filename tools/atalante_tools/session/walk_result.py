@@ -61,11 +61,11 @@ class WalkResult:
     full_assist: bool  # whether a diagnostic made the HAL ramp the assistance factor to 1 (state FULL_ASSIST)
     lateral_m: float  # sideways deviation from the walking line at the last landing [m], positive to the left
     yaw_deg: float  # heading of the soles relative to the walking line at the last landing [deg], positive to the left
-    #: true sideways deviation from the initial walking line at the end of the walk [m]; None if the robot is real or fell
+    #: true sideways deviation from the initial walking line at the end of the walk [m]; None if unknown, as after a fall
     true_lateral_m: float | None
-    #: true heading relative to the initial walking line at the end of the walk [deg]; None if the robot is real or fell
+    #: true heading relative to the initial walking line at the end of the walk [deg]; None if unknown, as after a fall
     true_yaw_deg: float | None
-    #: root mean square of the angle between true and estimated vertical during the walk [deg]; None if the robot is real
+    #: root mean square of the angle between true and estimated vertical during the walk [deg]; None if unknown
     attitude_rms_deg: float | None
     distance_m: float  # distance that the robot walked along the walking line [m]
     unnoticed: int  # number of steps in which no landing of the foot was detected

@@ -44,7 +44,7 @@ from atalante_tools.trial.plan import STEP
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: Number of cycles from the fork of the walk to the first cycle of the fault.
+#: Number of cycles from the fork of the walk to the cycle in which the fault begins.
 #: A fork one cycle before the fault would be too late: the emulated robot already has the frames of the first faulty cycle.
 _LEAD: Final = 5
 #: Number of cycles for which the HAL is observed after a fall.
@@ -61,8 +61,8 @@ _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
 _LANDED: Final = frozenset({Phase.STEP, Phase.STOP, Phase.BACK})
 _PELVIS: Final = IMUS.index("pelvis")
-#: Resolution of the bisection for the longest fault duration without a fall [cycles]. The result may be too short, but not
-#: by more than `RESOLUTION`.
+#: Resolution of the bisection for the longest fault duration without a fall [cycles].
+#: The result may be too short by at most `RESOLUTION`.
 RESOLUTION: Final = 10
 
 
