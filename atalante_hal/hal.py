@@ -47,10 +47,10 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: TORQUE_SATURATED is confirmed after more than `SATURATED_CYCLES` consecutive cycles in which the limiter changes a torque.
 SATURATED_CYCLES = 200
-#: Largest number of consecutive controller exceptions that the HAL bridges while the robot walks on the ground.
-#: After a bridged exception, the HAL sends the last torques again.
+#: Largest number of consecutive controller exceptions that the HAL tolerates while the robot walks on the ground.
+#: After a tolerated exception, the HAL sends the last torques again.
 #: If more than `BRIDGED_ERRORS` consecutive cycles have an exception, CONTROLLER_LOST is confirmed, which leads to HOLD.
-#: A drive, too, bridges up to `BRIDGED_ERRORS` consecutive lost commands.
+#: A drive, too, tolerates up to `BRIDGED_ERRORS` consecutive lost commands.
 BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0

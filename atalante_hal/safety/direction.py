@@ -72,7 +72,8 @@ TRAVEL = math.radians(1.5)
 LOAD = 1.0 / 3.0
 #: F is the sum of the forces on a foot in two consecutive cycles. A foot has hit the floor if two conditions hold for one F.
 #: First condition for a hit: the magnitude of F exceeds `HIT * cell_free`.
-#: Second condition for a hit: F differs from twice the median force on the foot in the test by more than `HIT * cell_free`.
+#: Second condition for a hit: the magnitude of F - 2 m exceeds `HIT * cell_free`.
+#: Here, m is the median force on the foot in the test.
 #: `HIT * cell_free` is about four times the rms noise of F (sum of the forces on a foot in two consecutive cycles).
 #: If the floor stops a moving ankle, F (sum of the foot forces in two consecutive cycles) is at least 1.5 * `HIT * cell_free`.
 HIT = 2.0

@@ -53,7 +53,7 @@ SUNK: Final = math.radians(3.0)
 #: Torque below which a motor is regarded as being without torque, as a share of the drive's torque limit.
 POWERLESS: Final = 0.1
 #: Largest difference between the encoder angle and the IMU angle of a joint that confirms the encoder [rad].
-#: Without this confirmation, the joint may not have moved. So its motor is not counted as a motor without torque.
+#: If the IMUs do not confirm the encoder, a motion of the joint is not proven. So no missing torque of its motor is reported.
 ENCODER_ERROR: Final = math.radians(1.0)
 #: The count of faulty cycles restarts if the joint moves back or slows down, because its drive then works.
 #: - Moves back: the joint moves towards the position in which the hold began, faster than `SLOWER` [rad/s].

@@ -252,7 +252,7 @@ class MessageMonitor:
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
         # `tolerance.longer` delays the timeout only in cycles without an accepted frame.
-        # With an accepted frame, the DBC timeout applies, because the plausibility checks ignore data of that age.
+        # In a cycle with an accepted frame, the DBC timeout applies: the plausibility checks ignore data as old as this timeout.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

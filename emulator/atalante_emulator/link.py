@@ -318,7 +318,7 @@ class FaultyBus(WrappedBus):
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
         """Apply all active faults to each frame. Return the frames that are sent in this cycle."""
         passing: list[Frames] = []
-        # Index of the first frame that is not yet in `passing`. No fault changed the frames `unchanged` to `row - 1`.
+        # Index of the first frame that is not yet in `passing`. No fault has changed the frames from this index to `row - 1`.
         unchanged = 0
         for row, can_id in enumerate(frames["can_id"].tolist()):
             acting = self._acting.get(can_id, ())

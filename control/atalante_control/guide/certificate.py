@@ -253,7 +253,7 @@ class _Horizon:
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector, following: Vector) -> Limit:
-        """Compute the disturbance torques at which the error one cycle after the prediction reaches the bound of the guide.
+        """Compute the disturbance torques that move a joint to the bound of the guide in the first cycle after the prediction.
 
         The next error is the error one cycle after the last predicted cycle. `scale` is the ratio of the computed torques to the
         requested torques.

@@ -139,7 +139,7 @@ class GuideTables(NamedTuple):
     #: Example: highest[2, 5] is the maximum of reach[2, 50] to reach[2, 59].
     highest: Vector
     #: (starts, rows, 12) largest changes of torque [Nm] and speed [rad/s] due to disturbances. Columns: see the class docstring.
-    #: Example: few_reach[2, 3] is the change few[3].lag cycles ahead, if the prediction starts in one of the cycles 8 to 11.
+    #: Example: few_reach[2, 3] is the change after `few[3].lag` cycles of a prediction that starts in one of the cycles 8 to 11.
     few_reach: Vector
     #: (n, COLUMNS) values of gait and guide in each cycle of a step.
     #: In an airwalk (robot suspended), additional rows contain the first cycles of the next step.

@@ -71,8 +71,8 @@ class FaultRun:
     """Result of one walk with a fault."""
 
     moment: str  # one of `FaultTrial.moments`
-    #: "walked" (two steps after the fault, or to the end), "hold" (stopped upright), "fell", "exception", or "unfinished"
-    #: (after `_LONGEST` cycles, the robot is upright and the controller still drives the joints)
+    #: "walked" (two steps after the fault, or to the end), "hold" (stopped upright), "fell", "exception", or "unfinished".
+    #: Unfinished means that the robot is upright after `_LONGEST` cycles, and that the controller still drives the joints.
     outcome: str
     state: str  # state of the HAL at the end
     #: diagnostics since the first faulty cycle, in the order of their first report; the severity `info` is left out

@@ -31,8 +31,8 @@ from atalante_tools.trial.plan import PushTrial
 _PUSHED: Final = 3
 #: Number of periodic steps after the pushed step.
 _AFTER: Final = 4
-#: Phase at which the process of the walk is forked, in the step before the pushed step.
-#: Each walk with a push continues from this fork.
+#: Phase at which the process of the walk is copied, in the step before the pushed step.
+#: Each walk with a push continues in a copy of this process.
 _LEAD: Final = 0.875
 
 

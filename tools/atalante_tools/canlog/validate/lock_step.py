@@ -42,10 +42,10 @@ class _Channel:
     #: The clock reads the cycle number only from the message with the index `sync`.
     sync: int = -1
     cycle: int = 0  # cycle number in the last SYNC
-    begin: int = 0  # new stamp (robot time) of the last SYNC [ns]
+    begin: int = 0  # robot time of the last SYNC [ns]
     wall: int = 0  # wall-clock stamp of the last SYNC [ns]
     count: int = 0  # number of frames from the last SYNC to the last frame, both included
-    last: int = -(1 << 62)  # new stamp (robot time) of the last frame [ns]
+    last: int = -(1 << 62)  # robot time of the last frame [ns]
 
 
 class LockStepClock:
