@@ -15,7 +15,7 @@ from atalante_hal.wire.frame import Frames
 
 #: Longest wait of a call of `receive` while the link is lost [s]. Each of these calls tries the link once.
 RETRY_PERIOD = 0.1
-#: Time for which the error message of a lost link must not change before the message is reported [s].
+#: The error message of a lost link is reported when it has been the same for `SETTLE_TIME` [s].
 #: A removed interface causes the error "down" and soon afterwards the error "removed". So only "removed" is reported.
 SETTLE_TIME = 0.1
 

@@ -70,7 +70,7 @@ TRAVEL = math.radians(1.5)
 #: `LOAD * cell_free` is about four times the rms noise of the mean force on a foot.
 #: The rms noise of the mean force on one cell is half the rms noise of the mean force on the foot, which has four cells.
 LOAD = 1.0 / 3.0
-#: F is the sum of the forces on a foot in two consecutive cycles. A foot has hit the floor if two conditions hold for one F.
+#: F is the sum of the forces on a foot in two consecutive cycles. A foot has hit the floor if a value of F meets two conditions.
 #: First condition for a hit: the magnitude of F exceeds `HIT * cell_free`.
 #: Second condition for a hit: the magnitude of F - 2 m exceeds `HIT * cell_free`.
 #: Here, m is the median force on the foot in the test.

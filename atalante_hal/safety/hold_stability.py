@@ -45,7 +45,7 @@ SATURATED: Final = (0.9, 1.05)
 #: Number of consecutive faulty cycles (overload or motor without torque) after which a drive is reported.
 OVERLOADED: Final = 20
 #: Overload is counted only at a distance of at least `AWAY` from the position in which the hold began [rad].
-#: A drive that holds its joint keeps the distance smaller than `AWAY`. So a wrong reported torque alone is no overload.
+#: A drive that holds its joint keeps the distance smaller than `AWAY`. So a wrong reported torque alone is not counted.
 AWAY: Final = math.radians(1.0)
 #: A motor without torque is counted only at a distance of at least `SUNK` from the position in which the hold began [rad].
 #: At the distance `SUNK`, a working drive with the stiffness `Robot.hold_kp` requests more than half of `Robot.torque_max`.

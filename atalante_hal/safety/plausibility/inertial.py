@@ -89,7 +89,7 @@ class Record(NamedTuple):
     #: Elements 0 to 3: gyroscope checks of the IMUs; 4: check of torso against pelvis; 5 to 8: accelerometer checks of the IMUs.
     samples: Vector
     force: Vector  # (4, 3) mean difference between specific force and gravity, in world axes [m/s2]
-    #: Mean square difference between two angular velocities that must be equal, about three axes, shape (5, 3) [rad2/s2].
+    #: Mean square difference between two angular velocities that must be equal, shape (5, 3) [rad2/s2]. Columns: the three axes.
     #: Rows 0 to 3, one for each IMU: its gyroscope minus the rate of change of its attitude.
     #: Row 4: gyroscope of the torso minus gyroscope of the pelvis.
     rate_error: Vector

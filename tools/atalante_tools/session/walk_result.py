@@ -36,7 +36,7 @@ class WalkResult:
     outcome: str  # how the walk ended: stood, fell, stopped, hold or fault
     engine: str | None  # physics engine of the emulated robot; None means the real robot
     xi: float
-    shape: str | None  # guide shape; None if no step was guided and `xi` is 1
+    shape: str | None  # guide shape; None if `xi` is 1 and no step had a guide
     #: Assistance factor of the guide with the smallest certified hip torque. The next three fields describe this guide.
     #: None if `shape` is None.
     promise_xi: float | None
