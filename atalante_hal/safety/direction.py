@@ -189,7 +189,7 @@ class DirectionProof:
         self.late = 0
         #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.
         #: Each joint adds a share (0 to 1) to the score of a delay: the part of its motion that the delayed torque explains.
-        #: A joint adds its share only if it passed a test with a short pulse and more than two joints.
+        #: A joint adds its share only if it passed a test that had a short pulse and tested more than two joints at once.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         #: Vertical forces on the cells of each foot in each cycle of the current test, shape (2, 4) [N].
@@ -258,7 +258,8 @@ class DirectionProof:
         if not travel.max() <= TRAVEL:
             far = np.flatnonzero(travel > 0.5 * TRAVEL)
             # Gravity makes both legs sag equally far, so a faulty joint moves farther than the same joint of the other leg.
-            # A faulty joint also moves its lighter neighbours. The factor `_kp` (stiffness) reduces the excess of light joints.
+            # A faulty joint also moves its neighbours, and a light neighbour moves far. So each difference between the legs is
+            # weighted with the stiffness `_kp`, which is small for light joints.
             excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
             joint = int(far[np.argmax(excess[far])])
             self._fail(far.tolist())

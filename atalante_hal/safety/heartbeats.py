@@ -24,7 +24,7 @@ from atalante_hal.wire.e2e import FULL, Check, suspect
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Values of the signal NodeState (CiA 301): 0 once after the node has started, 5 in normal operation.
+#: Values of the signal NodeState (CiA 301): 0 in the first status message after the start of a node, 5 in normal operation.
 #: All other values mean that the node does not work, for example 4 (STOPPED) and 127 (PRE-OPERATIONAL).
 BOOT_UP, OPERATIONAL = 0, 5
 #: Largest check result of a frame with new data. Such a frame has the result `Check.OK` (0) or `Check.SOME_LOST` (1).

@@ -23,7 +23,7 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 
 #: Time limit of a start [cycles]. In READY and HOLD, the limit covers the enabling of all drives and the direction test.
 ENABLE_CYCLES = 200
-#: Time without a state change of any drive after which a start in READY or HOLD ends [cycles].
+#: A start in READY or HOLD ends if no drive has changed its state for `STALLED_CYCLES` cycles.
 #: Even if four consecutive commands and then four consecutive answers of a drive are lost, the start does not end.
 STALLED_CYCLES = 10
 #: Largest speed of a joint at which START is accepted in HOLD [rad/s]. The test of the joint directions needs joints at rest.

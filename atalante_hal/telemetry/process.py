@@ -38,8 +38,7 @@ CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
 RUN_GAP_NS = 1_000_000_000
 
 
-#: Longest time in which the subprocess may read no record although a ring contains records [s].
-#: After this time, the subprocess counts as hung.
+#: The subprocess counts as hung if it has read no record for `HANGS_AFTER` [s] while a ring contained records.
 HANGS_AFTER = 2.0
 #: Largest number of restarts in a session.
 RESTARTS = 3

@@ -149,7 +149,7 @@ class ActivePatient:
         self._wobble = np.ones((cycles, 2))  # random factor on the wanted torque: 1 + noise, mean 1
         #: Joint angle error (nominal minus true) [rad], and the rate of the error [rad/s].
         self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
-        #: Threshold of perception of the joint angle error in each cycle [rad].
+        #: Smallest joint angle error that the patient perceives [rad], for each cycle of a step.
         #: The threshold of the hip angle is 0 while the patient feels a vibration motor of the thigh.
         #: The threshold of the knee angle is 0 while the patient feels a vibration motor of the shank.
         self._threshold = np.full((cycles, 2), parameters.threshold)

@@ -18,7 +18,7 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
 #: Tolerance of the joint ranges in the search [rad]: joints of a landing pose may be outside their range by a smaller angle.
-#: Near a pose within the tolerance, the optimiser can still find a pose with all joints inside their ranges.
+#: From such a landing pose, the optimiser can still find a nearby pose with all joints inside their ranges.
 _TOLERANCE = math.radians(0.5)
 _CENTRE_WEIGHT = 1e-6  # weight of (joint angle - middle of the range)^2; the weight of (angle outside the range)^2 is 1
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}

@@ -243,9 +243,9 @@ class Effect(NamedTuple):
 
     #: Shape (n, 2, 2). The element pushed[i] is the effect of a disturbance, i cycles after the start of the disturbance.
     #: The disturbance is an acceleration of 1 rad/s2 for one cycle.
-    #: For an error or a speed, `pushed` contains the change of the error or of the speed.
-    #: For a torque, `pushed` contains an acceleration, which the mass matrices `left` convert to the torque.
-    #: For a torque change, `pushed` contains a change of the acceleration, which `left` converts to the torque change.
+    #: If the effect is a change of an error or of a speed, `pushed` contains this change.
+    #: If the effect is a torque, `pushed` contains an acceleration, which the mass matrices `left` convert to the torque.
+    #: If it is a torque change, `pushed` contains a change of the acceleration, which `left` converts to the torque change.
     pushed: Vector
     #: Shape (n, 2, 2). The element hidden[i] is the effect of a wrong start velocity on the value predicted i cycles ahead.
     #: The start velocity has the measurement error that a joint acceleration of 1 rad/s2 causes.

@@ -36,7 +36,7 @@ WALK_GAINS = PidGains(
 #: `stiffness` is larger than in the air, because the leg of the exoskeleton also carries the leg of the patient.
 #: `hand_over` (largest deviations at the start of a step for which the guide is certified) covers the deviations after a landing.
 #: On the ground, the controller adds no torque that smooths the torque jump at a stance change (`carried` is 0).
-#: The torque limiter of the robot alone determines how fast the torque changes after a stance change.
+#: So only the torque limiter of the HAL limits how fast the torque changes after a stance change.
 WALK_GUIDE = StepGuideConfig(
     stiffness=(4500.0, 3300.0),
     hand_over=HandOver(

@@ -85,7 +85,7 @@ class PlacementConfig(NamedTuple):
     #: s, time in which the goal of the swing leg changes from joint angles to foot positions, after the first reaction to a push.
     #: The foot positions are relative to the stance foot, so a tilt of the pelvis does not move the swing foot.
     hold: float = 0.1
-    slew: float = 15.0  # 1/s, largest change of the phase rate per second
+    slew: float = 15.0  # 1/s, largest change per second of the phase rate, which is 1 at the nominal speed
 
 
 class Placement:

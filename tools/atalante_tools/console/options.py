@@ -233,7 +233,7 @@ def _gait_files(gait: Path | None, network: Path | None) -> GaitFiles:
 
 
 def gait_options(command: _Command) -> _Command:
-    """Add `--gait` and `--network` to a command, which then gets the argument `files`.
+    """Add the options `--gait` and `--network` to a command. The command function receives both values in its argument `files`.
 
     Args:
         command: Command to decorate.

@@ -36,7 +36,7 @@ PARTIAL: Final = 0.5
 #: Assistance factors of the sweep in the order of the trials, in a normal run and with `--quick`.
 SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
-#: Number of days in the sweep (one trial on the treadmill and one walk per assistance factor each day): normal run, `--quick`.
+#: Number of days in the sweep: in a normal run, with `--quick`. Each day has one trial on the treadmill and several walks.
 DAYS, QUICK_DAYS = 3, 1
 #: Number of steps in each guide shape, in a normal run and with `--quick`. Only steps with the right leg as stance leg count.
 SHAPE_STEPS, QUICK_SHAPE_STEPS = 30, 2

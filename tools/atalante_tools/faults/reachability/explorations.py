@@ -60,7 +60,7 @@ class Operator(NamedTuple):
 
 
 class Presses(NamedTuple):
-    """Presses of START, as long as they have not changed the supervisor state.
+    """Presses of START since the last change of the supervisor state.
 
     The search `moves` checks its properties with these values.
     """
