@@ -186,7 +186,7 @@ def _report_compilations(dispatcher: Any) -> None:
 
 
 def _mark(function: Callable[..., Any]) -> None:
-    """Record in the cache folder that a function creates arrays, see `_MARK`."""
+    """Create the file `_MARK` in the cache folder of a function that creates arrays."""
     folder = _folder(cast(FunctionType, function), False)
     if folder is not None:
         (folder / _MARK).touch()

@@ -57,8 +57,8 @@ class Envelope:
 class Derating:
     """Torque limit of a hot drive as a function of its temperature."""
 
-    start: float  # highest drive temperature with the full torque `torque_max` [degC]
-    end: float  # lowest drive temperature with the smallest torque limit, `floor * torque_max` [degC]
+    start: float  # temperature above which the torque limit is reduced [degC]
+    end: float  # temperature from which the torque limit has its smallest value, `floor` times `torque_max` [degC]
     floor: float  # share of torque_max, 0 to 1
 
 

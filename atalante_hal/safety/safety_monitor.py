@@ -453,7 +453,7 @@ class SafetyMonitor:
                 self._proof_begun = False
                 if state.supervisor is _S.READY or not self._tested:
                     # A drive that is off now has not been tested since the robot entered READY, or has never been tested.
-                    # So each drive that is off now is switched off again if the start fails.
+                    # So if the start fails, each drive that was off before the start is switched off again.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(JOINT_NODES, on, strict=True) if not is_on)
             self.start_cycles_left = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0

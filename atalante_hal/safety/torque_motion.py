@@ -76,10 +76,10 @@ PAUSE: Final = 5
 _PEAK_SHARE: Final = 0.8
 #: Factor by which each check with a deviation reduces `Deviations.peak`, so that an old maximum is forgotten.
 _PEAK_DECAY: Final = 0.97
-#: Smallest weighted number of checks with which a motor can be suspected.
-#: The weighted number is `Deviations.sums[window, joint, 0]`: each check adds 1, and older checks count less.
-#: Three checks are enough: their weighted number is at least 1 + 0.8 + 0.8^2 = 2.44.
-#: Two checks are not enough: their weighted number is at most 1 + 0.96 = 1.96.
+#: Smallest sum of the weights of all checks with which a motor can be suspected.
+#: The sum is `Deviations.sums[window, joint, 0]`: the last check has the weight 1, and older checks have smaller weights.
+#: Three checks are enough: the sum of their weights is at least 1 + 0.8 + 0.8^2 = 2.44.
+#: Two checks are not enough: the sum of their weights is at most 1 + 0.96 = 1.96.
 _LEAST_WEIGHT: Final = 2.4
 _LEG: Final = len(LEG_JOINTS)
 

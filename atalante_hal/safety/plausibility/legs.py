@@ -151,8 +151,8 @@ class Legs:
         self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: For each joint: comparison of the last sample in which its encoder reading changed.
-        #: While the reading is constant, the error of this comparison follows a slow drift of the IMUs.
+        #: For each joint: result of the comparison in the last sample in which the encoder reading of the joint changed.
+        #: While the reading is constant, a slow drift of the IMUs is added to the error in this result.
         self._moved: list[_Comparison | None] = [None] * len(JOINTS)
         #: Number of consecutive samples in which the leg turned but the encoder reading was constant, by joint index.
         self._turned: dict[int, int] = {}
@@ -468,7 +468,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float, rate: float) -> _Comparison:
-    """Return a copy of the comparison `moved` whose error (encoder minus IMU) follows a slow drift of the IMUs.
+    """Return a copy of the comparison `moved`, in which a slow drift of the IMUs is added to the error (encoder minus IMU).
 
     Args:
         moved: comparison when the encoder reading of the joint last changed.

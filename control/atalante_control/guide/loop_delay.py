@@ -15,7 +15,7 @@ from atalante_hal.types import State
 #: Largest additional delay that the certificate of a guide covers [cycles].
 COVERED: Final = DELAYS[1] - DELAYS[0]
 #: Number of consecutive cycles with a delay above `COVERED` after which the fault is confirmed. A single lost frame is no
-#: fault, although the data is then old for a cycle. The HAL tolerates the loss of up to a fifth of the frames.
+#: fault, although the controller then uses old data for one cycle. The HAL tolerates the loss of up to a fifth of the frames.
 _CONFIRM: Final = 5
 # Indices in JOINTS of the joints with a guide: sagittal hip and knee of both legs.
 _LEFT_SH, _LEFT_SK, _RIGHT_SH, _RIGHT_SK = (JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SH", "SK"))

@@ -15,7 +15,7 @@ _LARGEST_TWIST = 60.0
 
 
 def contact_force(load: float, twist: float) -> float:
-    """Return the vertical force of the floor on a foot [N], corrected for one cell with too large a value.
+    """Return the vertical force of the floor on a foot [N]. The value of one force cell may be too large: it is corrected.
 
     The sole is a rigid plate on four equal cells. Wherever the floor acts, the sum of the forces on FL and RR is equal to the sum
     on FR and RL. The difference, the twist, is therefore the error of a wrong cell. A twist that is larger than the noise is

@@ -237,7 +237,7 @@ def test_command_frames_at_full_assistance_are_equal_to_those_without_assistance
         (
             ["--record-rate", "333"],
             2,
-            "must be a divisor of 1000 (1, 10, 50, 100, 200, 250, 500, 1000, ...), got '333'",
+            "must be a divisor of 1000, such as 1, 10, 50, 100, 200, 250, 500 or 1000, got '333'",
         ),
         (["--record-rate", "0"], 2, "got '0'"),
         (["--can-log", "frames.xyz"], 2, "end its name in one of .log"),

@@ -13,8 +13,8 @@ from atalante_tools.conform.requirement import Outcome
 
 #: Length of a window [cycles]. In each window, the integral of the velocity is compared with the change of the position.
 WINDOW: Final = 50
-#: Largest accepted difference between 1 and the ratio of integral to position change. A velocity filter in the drive changes
-#: the ratio only slightly, because the filter delays the integral and does not scale it.
+#: The integral of the velocity, divided by the change of the position, must be from 1 - `RATIO` to 1 + `RATIO`.
+#: A velocity filter in the drive changes the ratio only slightly, because the filter delays the integral and does not scale it.
 RATIO: Final = 0.2
 #: Smallest root mean square of the motion over all windows, as an angle of the motor [rad]. A smaller motion is not compared.
 #: The velocity signal has a finite resolution. The resulting rounding error of the integral over a window is at most

@@ -165,7 +165,7 @@ def moves_one_motor(tester: NodeTester) -> Outcome:
 
 
 def stays_in_range(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-05: the amplitude must stay between 0.5 and 1 if a raw value above the DBC range follows the level 0.5."""
+    """Test HAPTICS-05: after the command 0.5, a command above the DBC range must give an amplitude between 0.5 and 1."""
     found, passed = [], True
     for code in (201, 230, 254):
         _settle(tester, 0.5)

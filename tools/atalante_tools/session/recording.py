@@ -39,7 +39,7 @@ def _record_rate(text: str) -> int:
     """
     if text.isdecimal() and int(text) and not 1000 % int(text):
         return int(text)
-    raise click.BadParameter(f"must be a divisor of 1000 (1, 10, 50, 100, 200, 250, 500, 1000, ...), got {text!r}")
+    raise click.BadParameter(f"must be a divisor of 1000, such as 1, 10, 50, 100, 200, 250, 500 or 1000, got {text!r}")
 
 
 #: Options of a command that records its run: `--record-rate`, `--can-log` and `--telemetry`.

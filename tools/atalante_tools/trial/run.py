@@ -298,7 +298,7 @@ class Effort:
         self._cycle, self._totals, self._segments = 0, [(0.0, 0.0, 0.0)], list[int]()
 
     def sample(self) -> None:
-        """Store the total work and impulse of the muscles once per second of the periodic steps.
+        """Store the work and the impulse of the muscles so far. In the periodic steps, this is done once per second.
 
         Call this function in every cycle.
         """
