@@ -335,7 +335,7 @@ class HalSteps:
         monitor._reports.clear()
         monitor.start_cycles_left, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
         monitor.recalled = -RECALL_CYCLES  # cycle of the last QUICK_STOP, long ago, so that ACTIVE is not delayed
-        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search does not use `_stalled`.
+        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search does not use it.
         # Instead, it tries both results in each cycle: the start ends (`LAST_START`), and the start continues (`START`).
         monitor._stalled = 0
         monitor._ending = monitor._duplicate_found = monitor._ramping = monitor._proof_begun = False
