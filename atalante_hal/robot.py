@@ -48,7 +48,7 @@ class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
     look_ahead: float  # time over which the limiter predicts the joint position, at constant velocity [s]
-    #: Distance of the predicted position outside a position limit at which the outward torque has fallen to 0 [rad].
+    #: The outward torque is 0 if the predicted position is outside a position limit by `position_margin` [rad] or more.
     position_margin: float
     velocity_margin: float  # excess over the velocity limit at which the accelerating torque has fallen to 0 [rad/s]
 

@@ -93,7 +93,7 @@ class Heartbeats:
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
         self._unreported: set[str] = set()  # nodes whose active emergency `evaluate` has not reported yet
-        #: Nodes whose active emergency the last `evaluate` reported for the first time.
+        #: Nodes with an active emergency that was new in the last call of `evaluate`.
         self._just_reported: set[str] = set()
         #: Emergencies that were cleared before `evaluate` reported them, each as (node, diagnostic, error code).
         #: The next `evaluate` reports each emergency in `_brief` once.

@@ -99,7 +99,7 @@ class Record(NamedTuple):
     accel: Vector  # (4, 3) specific force in the last sample [m/s2]
     #: Number of samples that repeated the reading of each axis, shape (4, 6): gyroscope, then accelerometer.
     repeats: Vector
-    #: Missed turn of each axis, shape (4, 6) [rad]: rotation of the IMU that the constant reading of the axis does not contain.
+    #: Missed turn of each axis, shape (4, 6) [rad]: rotation of the IMU during which the reading of the axis should have changed.
     #: A missed turn beyond its limit is kept until the reading changes or the values are too old.
     missed: Vector
 
@@ -204,7 +204,7 @@ def follow(
             comparable = False
         if not used:
             # A skipped sample resets repeats and missed turns.
-            # Exception: a missed turn beyond its limit is kept until the values are too old.
+            # Exception: a `missed_turn` beyond its limit is kept until the values are too old.
             for axis in range(6):
                 if age[imu] >= NEVER or missed_turn(record, imu, axis) == 0.0:
                     record.repeats[imu, axis] = record.missed[imu, axis] = 0.0

@@ -92,7 +92,7 @@ _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
 #: Index of TH in `_AXES`. The encoder angle of TH minus its angle from the IMUs shows the heading drift of the IMUs.
 _HEADING = _AXES.index(("TH",))
-#: Index of the sum SH + SK in `_AXES`. IMUs that are mounted askew cause its error in the first comparison.
+#: Index of the sum SH + SK in `_AXES`. An error of this sum in the first comparison shows that the IMUs are mounted askew.
 _SAGITTAL = _AXES.index(("SH", "SK"))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)

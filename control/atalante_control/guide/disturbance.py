@@ -245,10 +245,10 @@ class Effect(NamedTuple):
     #: The disturbance is an acceleration of 1 rad/s2 for one cycle.
     #: If the effect is a change of an error or of a speed, `pushed` contains this change.
     #: If the effect is a torque, `pushed` contains an acceleration, which the mass matrices `left` convert to the torque.
-    #: If it is a torque change, `pushed` contains a change of the acceleration, which `left` converts to the torque change.
+    #: If the effect is a torque change, `pushed` contains a change of the acceleration. `left` converts it to the torque change.
     pushed: Vector
     #: Shape (n, 2, 2). The element hidden[i] is the effect of a wrong start velocity on the value predicted i cycles ahead.
-    #: The start velocity has the measurement error that a joint acceleration of 1 rad/s2 causes.
+    #: The start velocity is measured with a lag. Its error is the one at a joint acceleration of 1 rad/s2.
     #: An empty array of shape (0, 2, 2) means that the start velocity is assumed to be exact.
     hidden: Vector
     #: Shape (n, 2, 2). The changes of the quantity in cycle k of the step are left[k] @ pushed[i] and left[k] @ hidden[i].

@@ -22,8 +22,8 @@ class GuideStatistics:
     hand_overs_exceeded: int = 0
     #: number of steps in which the delay of the loop was too long, so the guide did not act or ended early
     late: int = 0
-    #: Assistance factors of the steps so far. A step that has no guide because the loop is late (`late`) adds no factor.
-    #: In a walk on the ground, only steps that start with a guide add a factor.
+    #: Assistance factors of the steps so far, without those steps that have no guide because the loop is late (`late`).
+    #: In a walk on the ground, only the factors of steps that start with a guide.
     factors: set[float] = field(default_factory=set)
 
     @property

@@ -94,7 +94,7 @@ class Placement:
     clock: float  # position in the phase table, in rows; for example, 10.5 is between row 10 and row 11
     pace: float  # phase rate: rows of the phase table per cycle; 1 is the speed of the gait
     #: 0: the swing leg follows the joint angles of the gait. 1: the swing ankle follows positions relative to the stance foot.
-    #: Between 0 and 1: the desired position of the swing ankle is between the positions for 0 and 1.
+    #: With a value between 0 and 1, the desired position of the swing ankle is a weighted mean of both.
     held: float
     target: Annotated[Vector, 2]  # m, requested landing offset in the walking frame: forwards, to the left
     offset: Annotated[Vector, 2]  # m, present landing offset, which follows `target` smoothly

@@ -49,7 +49,7 @@ class PhaseTable(NamedTuple):
     guided: Vector  # (m, 4) re-centring polynomials c0, c1, c0', c1' for hip and knee with a guide; row: cycle
     reach: Vector  # (2,) rad/s, speeds of sagittal hip and knee of the swing leg that move a late swing foot down
     lowering: float  # m/s, downward speed of a late swing foot that results from the joint speeds `reach`
-    #: Number of cycles after the end of the table in which hip and knee move with the speeds `reach`.
+    #: After the end of the table, hip and knee move with the speeds in `reach` for at most `reach_cycles` cycles.
     #: In these cycles, the desired knee angle does not fall below `Reach.knee`.
     reach_cycles: int
     #: Number of cycles after the end of the table in which foot placement lowers a late swing foot after a push.

@@ -140,7 +140,7 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
 
     def falls(cycles: int) -> bool:
         # With the permanent fault, the robot falls after `fatal` cycles.
-        # Up to the fall, a fault of at least `fatal` cycles has the effect of the permanent fault. So the robot falls, too.
+        # A fault of at least `fatal` cycles has the same effect until then. So the robot falls with this fault, too.
         if cycles >= fatal:
             return True
         stimuli = tuple(limited(stimulus, cycles) for stimulus in case.stimuli)

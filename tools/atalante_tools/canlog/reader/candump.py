@@ -141,9 +141,8 @@ def parse_usual(
     if begin < end:
         columns.words[row] = 0  # delete the payload of a line that the previous call could not parse completely
     while begin < end:
-        if (
-            text[begin] != _OPEN
-        ):  # check this first: after an empty last line, the buffer contains bytes of an earlier text
+        # Check this first: after an empty last line, the buffer contains bytes of an earlier text.
+        if text[begin] != _OPEN:
             break
         seconds, dot = _number(text, begin + 1, 10, 10)
         if dot == begin + 1 or text[dot] != _DOT or seconds > _MAX_SECONDS:
