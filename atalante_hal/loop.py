@@ -20,9 +20,9 @@ from atalante_hal.types import PERIOD, Controller, State
 
 #: Number of consecutive late cycles after which the robot goes to HOLD. A late cycle begins more than one period late.
 OVERRUNS_TO_HOLD = 3
-#: Largest lateness of a single cycle without HOLD [s]. The watchdog of the drives has the same timeout.
+#: Lateness of a single cycle above which HOLD follows [s]. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: Largest drift of the loop without HOLD [s]: growth of its delay against the clock within `DRIFT_CYCLES` cycles.
+#: Drift of the loop above which HOLD follows [s]. The drift is the growth of the delay of the loop within `DRIFT_CYCLES` cycles.
 DRIFT_TO_HOLD = 5e-3
 #: Number of cycles over which the growth of the loop's delay is measured, for the comparison with `DRIFT_TO_HOLD`.
 DRIFT_CYCLES = 50

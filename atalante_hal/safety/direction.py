@@ -78,7 +78,7 @@ LOAD = 1.0 / 3.0
 #: If the floor stops a moving ankle, F (sum of the foot forces in two consecutive cycles) is at least 1.5 * `HIT * cell_free`.
 HIT = 2.0
 #: Factor by which the pulse is larger in the second test of a joint near its end stop.
-#: The leg weight may press the joint onto the end stop, so the normal pulse of the first test may not move the joint.
+#: The leg weight may press the joint onto the end stop, so the pulse of the first test may be too small to move it.
 BOOST = 6.0
 #: Number of unsuccessful tests after which a joint fails.
 #: Exception: a joint does not fail if its foot carried load or hit the floor, unless the joint moved against its torque.

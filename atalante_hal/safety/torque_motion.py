@@ -87,7 +87,7 @@ _LEG: Final = len(LEG_JOINTS)
 class Tolerances(NamedTuple):
     """Properties of the joints that the check uses. Each field has the shape (12,)."""
 
-    error: Vector  # Nm, rms error of the produced torque, which is computed from the motion
+    error: Vector  # Nm, rms error of the torque that is computed from the motion
     low: Vector  # rad, position below which a joint is at its lower end stop
     high: Vector  # rad, position above which a joint is at its upper end stop
 

@@ -110,7 +110,7 @@ class Excess(NamedTuple):
     force: Vector  # (4,) magnitude of the mean difference between specific force and gravity [m/s2]
     rate: Vector  # (5,) largest rms difference in each row of `Record.rate_error` [rad/s]
     tilt: Vector  # (1,) angle between the upward directions of torso and pelvis [rad]
-    missed: Vector  # (4,) largest missed turn of the axes of each IMU, see `Record.missed` [rad]
+    missed: Vector  # (4,) rad, largest missed turn among the axes of each IMU, see `Record.missed`
 
 
 class Inertial:

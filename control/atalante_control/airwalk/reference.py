@@ -60,8 +60,8 @@ class GaitReference:
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # `_angles` holds the 12 angle deviations s(0) twice: first as factors of the columns of s, then of the columns of s'.
-        # `_rates` holds the 12 speed deviations at time 0 twice, with the same order of columns.
+        # `_angles` holds the angle deviations of the 12 joints at time 0 twice: for their effect on angles, then on speeds.
+        # `_rates` holds the speed deviations of the 12 joints at time 0 twice, in the same order.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:

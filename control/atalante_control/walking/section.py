@@ -147,7 +147,10 @@ def _fading(duration: float) -> Vector:
 
 
 def _tables(gaits: WalkGaits, models: Models, config: WalkConfig) -> dict[tuple[Phase, int], PhaseTable]:
-    """Return the table of each phase for each stance leg. A walk starts on the right foot and can stop on either foot."""
+    """Return the table of each phase of a walk, for each possible stance leg.
+
+    A walk starts on the right foot and can stop on either foot.
+    """
     robot, worn, gravity, kinematics, exoskeleton = models
     standing = Standing(worn, gravity, exoskeleton, robot)
     tables: dict[tuple[Phase, int], PhaseTable] = {}

@@ -312,7 +312,7 @@ SCENARIOS: Final = (
         ),
     ),
     # Only the frontal hip (FH) and the sagittal hip (SH) have a case with a reversed motor.
-    # With a reversed motor, each other joint (TH, SK, SA, HA) exceeds its velocity limit before the HAL can react.
+    # With a reversed motor, each of TH, SK, SA and HA exceeds its velocity limit before the HAL can react.
     Scenario(
         "F84",
         tuple(
