@@ -44,7 +44,8 @@ HANGS_AFTER = 2.0
 RESTARTS = 3
 #: Time between two attempts of `close` to kill a subprocess that is still starting [s].
 _KILLED = 0.1
-#: Longest time from the summary of the subprocess to the end of its Zenoh session [s]. Then `close` kills the subprocess.
+#: Time limit for the subprocess to end its Zenoh session after it has sent its summary [s].
+#: If the subprocess needs more time, `close` kills it.
 _SESSION_END = 2.0
 #: Time limit for the start of a restarted subprocess [s].
 #: A subprocess that is not ready in time is ended. Then `tend` restarts the subprocess again.

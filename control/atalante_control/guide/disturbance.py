@@ -259,7 +259,7 @@ class Effect(NamedTuple):
 class Grid(NamedTuple):
     """Set of predictions that `spread` examines: each start cycle is combined with each prediction length."""
 
-    starts: int  # number of start cycles; the start cycles are 0 to starts - 1
+    starts: int  # number of start cycles: the predictions start in the cycles 0 to `starts - 1`
     #: number of start cycles that share one row of the result. Example: if block = 4, row 2 is for the start cycles 8 to 11
     block: int
     lags: NDArray[np.int64]  # (lags,) prediction lengths [cycles], ascending

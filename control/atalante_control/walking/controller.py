@@ -320,7 +320,7 @@ class WalkController:
             section.prepare()
 
     def certificates(self, xi: float) -> list[Certificate]:
-        """Return the certificate of the guide of each section at an assistance factor, in walking order.
+        """Return the certificates of the guides at an assistance factor, in the order of the sections of the walk.
 
         Args:
             xi: assistance factor in [0, 1].

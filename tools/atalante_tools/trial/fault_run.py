@@ -139,8 +139,7 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
     fatal = permanent.fallen
 
     def falls(cycles: int) -> bool:
-        # With the permanent fault, the robot falls after `fatal` cycles.
-        # A fault of at least `fatal` cycles has the same effect until then. So the robot falls with this fault, too.
+        # With the permanent fault, the robot falls after `fatal` cycles. So it also falls if the fault lasts that long or longer.
         if cycles >= fatal:
             return True
         stimuli = tuple(limited(stimulus, cycles) for stimulus in case.stimuli)

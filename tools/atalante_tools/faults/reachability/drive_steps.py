@@ -43,7 +43,7 @@ class Drive(NamedTuple):
     """State of a drive between two cycles."""
 
     state: DriveState
-    latched: bool  # whether the drive left OPERATION ENABLED without a command, so that it ignores ENABLE OPERATION
+    latched: bool  # whether the drive ignores ENABLE OPERATION, because it left its enabled state without a command
     missed: int  # age of the last valid command [cycles]; ages above `WATCHDOG` are stored as `WATCHDOG`
     unsynced: int  # number of consecutive cycles without SYNC; numbers above `WATCHDOG` are stored as `WATCHDOG`
     errors: tuple[int, ...]  # codes of the errors whose cause persists

@@ -53,7 +53,7 @@ QUALIFICATIONS: Final = {
 #: `_OLDER`: a frame before the last accepted frame. `_ROGUE`: a frame of a second sender.
 #: If the RequestCounter of the next frame differs from the RequestCounter of the checked frame, a button was pressed.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
-#: RequestCounter (counter of button presses) in the checked frame, by code (`_NONE`, `_LATEST`, `_OLDER`, `_ROGUE`).
+#: RequestCounter (counter of button presses) in the checked frame, for each of `_NONE`, `_LATEST`, `_OLDER` and `_ROGUE`.
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
 
