@@ -62,7 +62,7 @@ CONFIRMED = {
     Check.CONFLICT: Dtc.E2E_FROZEN,
 }
 #: E2E check results of rejected frames that may come from a second sender.
-#: Two nodes send a message if it has at least two intact frames in one cycle, one of them rejected with such a result.
+#: It is a sign of two senders if a message has at least two intact frames in one cycle, one of them with such a result.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)

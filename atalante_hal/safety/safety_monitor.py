@@ -151,7 +151,7 @@ class SafetyMonitor:
         self.torque_motion: TorqueMotion | None = None
         #: DBC names of the drives that stay off until a start passes its direction test (attribute `proof`).
         #: 1. Drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the direction test.
-        #: 2. Drives that were off when START was pressed, if this was in READY or before any start had passed the test.
+        #: 2. Drives that were off when START was pressed, if START was pressed in READY, or if no start had passed the test yet.
         #: A start enables the drives in `_kept_off` for the direction test. If the start fails, they are switched off again.
         self._kept_off: set[str] = set()
         self._tested = False  # True after a start has passed the direction test

@@ -50,7 +50,7 @@ class SignalTable(NamedTuple):
     codes: Words  # (size,) raw codes of the last decoding or encoding
     words: Words  # (n,) indices of all 64-bit words of the frame array that contain a signal
     by_row: Words  # (size,) indices of all signals, sorted by the row of the frame that contains the signal
-    row_begins: Words  # (rows + 1,) start index of each row in `by_row`: row r is by_row[row_begins[r] : row_begins[r + 1]]
+    row_begins: Words  # (rows + 1,) start index of each row in `by_row`; row r ends before the start of row r + 1
 
 
 @lru_cache(maxsize=4096)

@@ -273,7 +273,7 @@ def add_missed(imu: int, now: Readings, record: Record, turn: tuple[float, float
 
 
 def add_repeat(record: Record, imu: int, axis: int, same: bool, missed: float) -> None:
-    """Count a repeated reading, and add to the missed turn the rotation that the reading does not contain.
+    """Count a repeated reading, and increase the missed turn by the rotation that the reading does not contain.
 
     If the reading has changed, set the number of repeats and the missed turn to 0.
 

@@ -61,7 +61,7 @@ _SETTLING_TIME = 2.0
 _LEAST_LEVER = 0.007
 #: Share of the mean square of v in `knee_error` that an error of a knee angle must explain, so that the error is reported.
 #: v in `knee_error` is the filtered difference between the measured and the computed position of the tibia IMU.
-#: The part of the difference that wrong segment lengths explain is already subtracted from v.
+#: The part of the difference that is due to wrong segment lengths is already subtracted from v.
 _SHARE = 0.25
 #: Number of low-passes for each axis of a leg.
 _FILTERS = 11

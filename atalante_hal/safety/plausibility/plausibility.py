@@ -47,7 +47,7 @@ SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
 _PERIOD = 32
 #: Intervals between the inertial checks [cycles], used alternately.
-#: Both intervals are odd, so the checks run alternately in even and in odd cycles.
+#: Both intervals are odd, so an inertial check in an even cycle is followed by one in an odd cycle, and so on.
 #: Reason: a vibration at half the sampling rate of the IMUs changes its sign in each cycle, so it cancels in the means.
 _INERTIAL_INTERVALS = (15, 17)
 #: Largest age of values that the trunk check uses [cycles].

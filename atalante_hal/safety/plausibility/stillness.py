@@ -120,7 +120,7 @@ class Stillness:
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
         # Convert the limits from cycles to samples. Example: with `every` = 16, 50 cycles become (50 - 15) // 16 = 2 samples.
-        # The 15 cycles are subtracted because the first repeated reading may be up to 15 cycles older than its sample.
+        # The 15 cycles are subtracted, because a reading may be constant for up to 15 cycles before its first sample.
         limit = np.full(size, _NO_LIMIT)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every

@@ -244,7 +244,7 @@ class Effect(NamedTuple):
     #: Shape (n, 2, 2). The element pushed[i] is the effect of a disturbance, i cycles after the start of the disturbance.
     #: The disturbance is an acceleration of 1 rad/s2 for one cycle.
     #: If the effect is a change of an error or of a speed, `pushed` contains this change.
-    #: If the effect is a torque, `pushed` contains an acceleration, which the mass matrices `left` convert to the torque.
+    #: If the effect is a torque, `pushed` contains an acceleration. The mass matrices `left` convert it to the torque.
     #: If the effect is a torque change, `pushed` contains a change of the acceleration. `left` converts it to the torque change.
     pushed: Vector
     #: Shape (n, 2, 2). The element hidden[i] is the effect of a wrong start velocity on the value predicted i cycles ahead.

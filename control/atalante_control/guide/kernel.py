@@ -101,7 +101,7 @@ class Block:
     slack: Annotated[Vector, (STATES, 2)]
     middle: Annotated[Vector, (COMPRESSED, 2)]  # (largest + smallest `Lag.ahead` in the block) / 2, for each element
     spread: Annotated[Vector, (COMPRESSED, 2)]  # (largest - smallest `Lag.ahead` in the block) / 2, for each element
-    ratio: float  # upper bound of predicted error / guide width in the block, computed in the last control cycle
+    ratio: float  # upper bound of the ratio of predicted error to guide width in the block, computed in the last control cycle
 
 
 class Few:

@@ -62,7 +62,7 @@ class LoopDelay:
 
     @property
     def confirmed(self) -> bool:
-        """Return whether the delay was uncovered at START and in all cycles since, or in the last `_CONFIRM` cycles."""
+        """Return whether the delay has exceeded `COVERED` in the last `_CONFIRM` cycles, or at START and in all cycles since."""
         return self._uncovered >= _CONFIRM
 
 

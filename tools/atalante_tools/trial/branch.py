@@ -123,7 +123,7 @@ def branch() -> Branch | Continuation:
                 theirs.send(_NoAnswer(os.waitstatus_to_exitcode(status)))
     except EOFError:  # the run has closed its end of the pipe, or has ended
         os._exit(0)
-    except BaseException:  # noqa: BLE001 - an error ends this waiting process, which must not run the code of the caller
+    except BaseException:  # noqa: BLE001 - after any error, this process must end here and not run the code of the caller
         os._exit(1)
     return Continuation(request, theirs)
 

@@ -206,7 +206,7 @@ class TimingRules:
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
         # Leave out the intervals with lost or rejected frames, and the intervals that begin or end at a repeated frame.
-        # Without an alive counter (`NO_STEP`), lost frames cannot be detected. So intervals with lost frames are counted.
+        # Without an alive counter (`NO_STEP`), lost frames cannot be detected. So all intervals are counted.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
