@@ -126,6 +126,8 @@ def _failure(request: StartRequest) -> str:
         within = f"and no drive changed its state for {STALLED_CYCLES} cycles"
     else:
         return ""
+    if request.supervisor in _ENABLING and (request.drive_state == DriveState.OPERATION_ENABLED).all():
+        return f"the direction test of the joints did not end {within}"
     return f"the drives were not enabled {within}: {_not_enabled(request.drive_state)}"
 
 

@@ -76,6 +76,7 @@ ENABLING = StartRequest(
 PRESSED = ENABLING._replace(pressed=True, cycles_left=200)
 ILL = {"diagnostic": "an encoder is stuck"}
 UNWELL = {"nodes_ready": False, "missing": {"LEFT_SK", "IMU_TORSO"}}
+ENABLED = np.full(12, float(D.OPERATION_ENABLED))
 STOP, RELEASED = "the operator asked to stop", "the dead-man switch was released or the pendant is lost"
 OFF = ", ".join(f"{joint} is in SWITCH_ON_DISABLED" for joint in JOINTS)
 FAILED = f"the drives were not enabled within 200 cycles: {OFF}"
@@ -101,6 +102,7 @@ def test_entry_text_of_off_names_the_missing_nodes():
         (ENABLING, {**ILL, **UNWELL}, ILL["diagnostic"]),
         (ENABLING, {**UNWELL, "cycles_left": 0}, "no answer or not trusted yet: IMU_TORSO, LEFT_SK"),
         (ENABLING, {"cycles_left": 0, "torque": OFF_TORQUE}, FAILED),
+        (ENABLING, {"cycles_left": 0, "drive_state": ENABLED}, "the direction test of the joints did not end within 200 cycles"),
         (ENABLING, {"stalled": 9}, None),
         (ENABLING, {"stalled": 10, "stop_requested": True}, STOP),
         (ENABLING, {"torque": OFF_TORQUE}, TORQUE),
