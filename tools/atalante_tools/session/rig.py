@@ -98,14 +98,21 @@ class Rig:
         Raises:
             Stopped: If a signal arrived before the run. The robot then did not move.
         """
-        ends = [self.hal.end] if on_stop is None else [self.hal.end, on_stop]
+        first = [] if on_stop is None else [on_stop]
+        #: True after the signal that leads to HOLD. Not in every HOLD: `until` may observe whether a robot in HOLD falls.
+        held = self.hal.ending
 
         def end() -> None:
-            (ends.pop() if len(ends) > 1 else ends[0])()
+            nonlocal held
+            if first:
+                first.pop()()
+            else:
+                held = True
+                self.hal.end()
 
         def over(state: State) -> bool:
             # In HOLD, the end condition `until` may never become true, for example if it waits for a number of steps.
-            return until(state) or (self.hal.ending and not self.hal.moving)
+            return until(state) or (held and not self.hal.moving)
 
         with ended_by(end) as stop:
             stop.check()
