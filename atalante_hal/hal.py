@@ -170,10 +170,8 @@ class Hal:
         state, image, transceiver = self._state, self._image, self._transceiver
         state.cycle = cycle = state.cycle + 1
         state.time = cycle * PERIOD
-        self.state.cycle, self.state.time = (
-            cycle,
-            state.time,
-        )  # set before SYNC is sent, because a CAN log reads the cycle of each frame
+        # Set before SYNC is sent, because a CAN log reads the cycle of each frame.
+        self.state.cycle, self.state.time = cycle, state.time
         late = 0 if image.all_fresh else transceiver.receive()  # number of late answers to the previous SYNC
         self._commands.synchronise(cycle)
         count = transceiver.receive(late, image, self.patience)

@@ -121,7 +121,7 @@ class EncoderChecks:
         self._low_pass = specialised(low_pass, *self._motion)
 
     def within_reach(self) -> bool:
-        """Return whether every joint is in its range and moved by no more than is possible in one cycle."""
+        """Return whether every joint is in its range and has not moved farther than a joint can move in one cycle."""
         return not (self.outside or self.too_fast) and self._within_reach(*self._positions)
 
     def follow(self) -> None:

@@ -72,7 +72,7 @@ class Decoder:
 
     def decode(self, chunk: Chunk) -> Iterator[DecodedFrames]:
         """Decode a chunk. Each yielded item contains all frames of one message."""
-        plan, can_ids = self._plan, chunk.frames["can_id"]
+        plan, can_ids = self._plan, chunk.can_ids
         rows = plan.rows(can_ids & np.uint32(~ID_REMOTE & 0xFFFFFFFF))
         carries = (can_ids & np.uint32(ID_ERROR | ID_REMOTE)) == 0
         known = (rows != UNKNOWN) & carries

@@ -83,7 +83,7 @@ class LockStepClock:
         Args:
             chunk: next frames of all channels. The frames of the same channel are in the order of arrival.
         """
-        rows = self._plan.rows(chunk.frames["can_id"])
+        rows = self._plan.rows(chunk.can_ids)
         stamps = chunk.stamps.copy()
         for number in np.unique(chunk.channels).tolist():
             at = np.flatnonzero(chunk.channels == number)
